@@ -146,8 +146,8 @@ class ControlSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "s",
-            "Time after which an experiment that does not renew its lease ends, and the fish fades "
-            "to neutral; use a longer time for slow links.",
+            "Time after which an experiment that does not renew its lease ends; longer for slow "
+            "links.",
             ge=MIN_LEASE_S,
             le=MAX_LEASE_S,
         ),
@@ -194,8 +194,8 @@ class Config(LoopSettings, frozen=True, forbid_unknown_fields=True, kw_only=True
         str,
         note(
             "Robot: simulated, a fish on its rod; pi, the robot on this Raspberry Pi; virtual-pi, "
-            "a simulated fish behind the robot's own drivers (fishctl virtual-pi); swimmer, a fish "
-            "that swims freely in a two-dimensional fluid; or one of another package."
+            "a simulated fish behind the robot's drivers; swimmer, a fish that swims freely; or "
+            "one of another package."
         ),
     ] = "simulated"
     robot_settings: Annotated[dict[str, Any], note("Settings of a robot of another package.")] = (
@@ -230,10 +230,7 @@ class Config(LoopSettings, frozen=True, forbid_unknown_fields=True, kw_only=True
     )
     sensors: Annotated[
         Mapping[str, SensorSettings],
-        note(
-            "Any number of other sensors, each a section with a name of its own. Those of a robot "
-            "have stand-ins on a simulated fish, whose servo has a model of its `power`."
-        ),
+        note("Any number of other sensors, each a named section."),
     ] = {}
     panel: Annotated[
         PanelSettings, note("E-stop button and status light, if the robot has them.")

@@ -215,9 +215,8 @@ class Tick(Struct, frozen=True, gc=False):
     readings: Annotated[
         dict[str, float] | UnsetType,
         note(
-            "Readings of the sensors by name, each the mean of its samples since the previous "
-            "tick or its latest one; old ones and all of a fish without sensors are absent. "
-            "`power` is the electrical power of the servo [W]. Status has their units."
+            "Readings of the sensors by name, without old ones; absent without sensors. `power` is "
+            "the electrical power of the servo [W]. Status has their units."
         ),
     ] = UNSET
     leak: Annotated[
