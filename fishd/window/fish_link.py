@@ -26,7 +26,7 @@ from fishd.window.live import encode_message
 log = logging.getLogger(__name__)
 
 MAX_TICKS = 2400
-"""Number of ticks in the history for a page that opens: two minutes of 20 Hz."""
+"""Number of ticks in the history for a page that opens; it bounds memory, whatever the tick."""
 HISTORY_AGE_S = 1.0
 """Longest age of the encoded history that is sent again [s]."""
 PART_TICKS = 200

@@ -29,8 +29,9 @@ ADC_STEPS = 32768
 """Number of steps of the ADC from zero to full scale."""
 MAX_SAMPLE_PERIODS = 1.25
 """Longest time of a conversion with its transfers, as a multiple of 1 / data rate."""
-MIN_PAIRS_PER_CONVERSION = 8 / 0.05 / 860
-"""Lowest number of pairs per nominal conversion on a bus of 400 kbit/s."""
+MIN_PAIRS_PER_CONVERSION = 160 / 860
+"""Lowest number of pairs per nominal conversion on a bus of 400 kbit/s: 160 pairs a second at 860
+samples a second."""
 SUPPLY_V = 3.3
 """Supply of the ADC and of the amplifiers in docs/how-to/wiring.md [V]."""
 
