@@ -31,7 +31,7 @@ from fishd.core.signals import Publisher, Truth
 from fishd.hardware import ownership, release_recipe
 from fishd.hardware.base import CalibratedParts, Robot
 from fishd.hardware.calibration_files import CalibrationFolder
-from fishd.hardware.driver import ServoDriver, read_counters
+from fishd.hardware.driver import ServoDriver, read_counters, read_limitations
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.hardware.recipes import Recipes
 from fishd.hardware.registry import FORCE_SENSORS, SENSORS, SERVOS, driver_packages
@@ -286,7 +286,7 @@ def assemble(
         lines = (
             *sensor.limitations,
             *(line for other in sensors for line in other.limitations),
-            *servo.driver.limitations,
+            *read_limitations(servo.driver),
         )
         if sensor.calibration.is_unset:
             lines += (
@@ -382,15 +382,14 @@ def open_sensor(
     newest = CalibrationFolder(state_folder(config)).newest(ForceCalibration)
     calibration = newest[0] if newest else ForceCalibration()
     with driver_packages(settings.driver):
-        driver = FORCE_SENSORS.find(settings.driver)(settings, clock)
-    return SampledSensor(
-        driver,
-        calibration,
-        clock,
-        threaded=threaded,
-        tick=config.tick,
-        between_samples=between_samples,
-    )
+        return SampledSensor(
+            FORCE_SENSORS.find(settings.driver)(settings, clock),
+            calibration,
+            clock,
+            threaded=threaded,
+            tick=config.tick,
+            between_samples=between_samples,
+        )
 
 
 def _calibration_warning(config: Config, servo: CalibratedServo) -> str | None:

@@ -9,8 +9,10 @@ suspicion and reconnecting are above it, the same for all drivers.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from itertools import islice
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
+from fishd.core import text
 from fishd.core.clock import Clock
 from fishd.core.foreign_code import call_foreign
 from fishd.core.schema import Problem, Reading, format_reading, note, unit
@@ -44,6 +46,11 @@ T = TypeVar("T", bound=ForceSensorSettings | SensorSettings)
 F = TypeVar("F", bound=ForceSensorSettings)
 R = TypeVar("R", bound=SensorSettings)
 V = TypeVar("V", bound=ServoSettings)
+
+MAX_LIMITATIONS = 16
+"""Largest number of limitations of a driver that are reported."""
+MAX_LINE_CHARACTERS = 300
+"""Largest length of a driver's line on its state, which each status contains [characters]."""
 
 
 class Claim(NamedTuple):
@@ -102,6 +109,24 @@ def read_counters(driver: Driver[Any]) -> dict[str, int]:
         return {str(name): int(count) for name, count in call_foreign(driver.counters).items()}
     except Exception:
         return {}
+
+
+def read_limitations(driver: "SampledDriver[Any] | ServoDriver[Any]") -> tuple[str, ...]:
+    """Return the limitations of a driver in short lines; one that says why if it raises."""
+
+    def read() -> tuple[str, ...]:
+        lines = driver.limitations
+        if isinstance(lines, str):  # the comma of a tuple of one is missing
+            lines = (lines,)
+        return tuple(
+            text.line(line, MAX_LINE_CHARACTERS) for line in islice(lines, MAX_LIMITATIONS)
+        )
+
+    try:
+        return call_foreign(read)
+    except Exception as error:
+        kind, why = text.quoted(type(driver).__name__), text.describe_error(error)
+        return (text.line(f"{kind} cannot name its limitations: {why}", MAX_LINE_CHARACTERS),)
 
 
 class Pair(NamedTuple):

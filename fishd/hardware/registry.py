@@ -65,7 +65,7 @@ def driver_packages(driver: str = "") -> Iterator[None]:
     """Translate the errors of importing and opening a driver.
 
     Raises `MissingPackage` if a library is not installed. If the driver is named, raises
-    `StartupError` for every other exception that is not a `FishdError`.
+    `StartupError` for every other exception that is not a `FishdError`, also for SystemExit.
     """
     try:
         yield
@@ -73,8 +73,8 @@ def driver_packages(driver: str = "") -> Iterator[None]:
         raise
     except ImportError as error:
         raise MissingPackage(why_not_imported(error, driver)) from None
-    except Exception as error:
-        if not driver:
+    except BaseException as error:
+        if not driver or isinstance(error, KeyboardInterrupt):
             raise
         raise StartupError(
             f"driver '{driver}' cannot start: {text.describe_error(error)}"

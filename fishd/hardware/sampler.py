@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 from fishd.core import text
 from fishd.core.clock import Clock
 from fishd.core.foreign_code import call_foreign
-from fishd.hardware.driver import Pair, SampledDriver, read_counters
+from fishd.hardware.driver import Pair, SampledDriver, read_counters, read_limitations
 
 X = TypeVar("X", Pair, Mapping[str, float])
 
@@ -77,7 +77,9 @@ class Sampler(Generic[X]):
         self.trouble = self._explain(error)
         self.errors += 1
         self._failures += 1
-        pause = max(self._driver.settling, _MIN_PAUSE_S)
+        pause = _MIN_PAUSE_S
+        with suppress(Exception):
+            pause = max(pause, call_foreign(getattr, self._driver, "settling"))
         if self._failures >= REOPEN_FAILURES:
             self.close()
             pause = min(MAX_PAUSE_S, pause * 2.0 ** min(self._failures - REOPEN_FAILURES, 10))
@@ -101,7 +103,6 @@ class SampledPart(ABC, Generic[X]):
         self._clock = clock
         self._counter = counter
         self._driver = driver
-        self._place = driver.place
         self._sampler: Sampler[X] = Sampler(driver, clock)
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
@@ -117,7 +118,7 @@ class SampledPart(ABC, Generic[X]):
     @property
     def limitations(self) -> tuple[str, ...]:
         """Reasons why the samples are not as good as they could be, a line each."""
-        return self._driver.limitations
+        return read_limitations(self._driver)
 
     def close(self, timeout: float = CLOSE_TIMEOUT_S) -> None:
         """Stop sampling and release the hardware; may be called twice, and never hangs.

@@ -52,6 +52,7 @@ class SampledSensor(SampledPart[Pair]):
         super().__init__(driver, clock, driver.transport)
         self.calibration = calibration
         """Calibration that turns voltages into forces."""
+        self._place = driver.place
         self._tick = tick
         self._quiet_time = min(QUIET_TIME_S, 0.125 * tick)
         self._step_time = 0.0

@@ -14,8 +14,10 @@ from rigs.processes import PATIENCE, wait_until
 from rigs.sensor_chips import BUS, Lsm6dsoxChip, SensorBoard, plug_thermometer
 
 from fishd.core.clock import SystemClock, VirtualClock
+from fishd.core.errors import StartupError
 from fishd.core.schema import Reading
 from fishd.hardware.driver import SensorDriver, SensorSettings
+from fishd.hardware.registry import driver_packages
 from fishd.hardware.sampler import close_all
 from fishd.hardware.sensors import ds18b20
 from fishd.hardware.sensors.analog import AnalogInput, AnalogSettings
@@ -189,6 +191,51 @@ def test_what_a_driver_returns_is_checked(
     assert (sensor.trouble or "").startswith(trouble)
     assert bool(sensor.trouble) == bool(trouble)
     assert "".join(sensor.doubts.values()).startswith(doubt)
+
+
+class Raising:
+    """An attribute that raises an exception when it is read."""
+
+    def __init__(self, error: BaseException) -> None:
+        self.error = error
+
+    def __get__(self, *_: object) -> Any:
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("limitations", "lines"),
+    [
+        (["it drifts\n", "it ages"], ("it drifts", "it ages")),
+        ("it drifts", ("it drifts",)),
+        (["it drifts"] * 10**6, ("it drifts",) * 16),
+        (None, ("Odd cannot name its limitations: TypeError: 'NoneType' object is not iterable",)),
+        ([5], ("Odd cannot name its limitations: TypeError: object of type 'int' has no len()",)),
+        (Raising(SystemExit(4)), ("Odd cannot name its limitations: SystemExit: 4",)),
+        (Raising(ValueError("no")), ("Odd cannot name its limitations: ValueError: no",)),
+    ],
+)
+def test_what_a_driver_says_of_itself_never_ends_fishd(
+    limitations: Any, lines: tuple[str, ...]
+) -> None:
+    odd = {
+        "limitations": limitations,
+        "place": Raising(SystemExit(4)),
+        "settling": Raising(OSError()),
+    }
+    clock = VirtualClock()
+    sensor = sampled(type("Odd", (Scripted,), odd), SensorSettings(kind="odd"), clock)
+    assert sensor.limitations == lines
+    assert values(sensor, clock) == {}  # it has no `act`
+    sensor._driver.act = lambda: {"flow": 1.0}  # type: ignore[attr-defined]
+    assert values(sensor, clock) == {"flow": 1.0}
+
+
+@pytest.mark.parametrize("error", [SystemExit(4), ValueError("no")])
+def test_a_driver_that_cannot_be_made_is_one_line(error: BaseException) -> None:
+    with pytest.raises(StartupError) as refusal, driver_packages("odd"):
+        raise error
+    assert str(refusal.value) == f"driver 'odd' cannot start: {type(error).__name__}: {error}"
 
 
 @pytest.mark.parametrize(("period", "expected"), [(TICK / 5, {2.0}), (2 * TICK, {0, 1, 2, 3, 4})])
