@@ -12,7 +12,13 @@ from typing import Any, Generic, TypeVar
 from fishd.core import text
 from fishd.core.clock import Clock
 from fishd.core.foreign_code import call_foreign
-from fishd.hardware.driver import Pair, SampledDriver, read_counters, read_limitations
+from fishd.hardware.driver import (
+    MAX_LINE_CHARACTERS,
+    Pair,
+    SampledDriver,
+    read_counters,
+    read_limitations,
+)
 
 X = TypeVar("X", Pair, Mapping[str, float])
 
@@ -87,9 +93,9 @@ class Sampler(Generic[X]):
 
     def _explain(self, error: Exception) -> str:
         try:
-            return call_foreign(self._driver.explain, error)
+            return text.line(call_foreign(self._driver.explain, error), MAX_LINE_CHARACTERS)
         except Exception:  # a failure of `explain` must not hide the error itself
-            return text.describe_error(error)
+            return text.line(text.describe_error(error), MAX_LINE_CHARACTERS)
 
 
 class SampledPart(ABC, Generic[X]):

@@ -9,9 +9,9 @@ from typing import Any
 
 from fishd.core import text
 from fishd.core.clock import Clock
-from fishd.core.foreign_code import real_number
+from fishd.core.foreign_code import call_foreign, real_number
 from fishd.core.schema import Reading, format_quantity, format_reading
-from fishd.hardware.driver import SensorDriver, SensorSettings
+from fishd.hardware.driver import MAX_LINE_CHARACTERS, SensorDriver, SensorSettings
 from fishd.hardware.sampler import SampledPart
 
 MIN_PERIOD_S = 5e-3
@@ -90,10 +90,10 @@ class SampledReadings(SampledPart[Mapping[str, float]]):
         now = self._clock.monotonic()
         while self._sampler.samples:
             try:
-                self._take(self._sampler.samples.popleft(), now)
+                call_foreign(self._take, self._sampler.samples.popleft(), now)
                 self._misfit = None
             except Exception as error:  # a driver of another package returns anything
-                self._misfit = text.describe_error(error)
+                self._misfit = text.line(text.describe_error(error), MAX_LINE_CHARACTERS)
         self._due = max(self._due + self._period, now)
 
     def _take(self, values: Mapping[str, float], now: float) -> None:
@@ -102,7 +102,8 @@ class SampledReadings(SampledPart[Mapping[str, float]]):
         for own_name, value in values.items():
             name = self._names.get(own_name, own_name)
             if name not in self.declared:
-                raise ValueError(f"it gives {name}, but declares {', '.join(self.declared)}")
+                named = text.quoted(str(name))
+                raise ValueError(f"it gives {named}, but declares {', '.join(self.declared)}")
             number = real_number(value, name)
             if not math.isfinite(number):
                 doubts[name] = f"{name} is not a number"

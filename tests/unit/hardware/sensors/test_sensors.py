@@ -13,6 +13,7 @@ from rigs.ads1115_board import ABSENT_BUS, Board
 from rigs.processes import PATIENCE, wait_until
 from rigs.sensor_chips import BUS, Lsm6dsoxChip, SensorBoard, plug_thermometer
 
+from fishd.core import text
 from fishd.core.clock import SystemClock, VirtualClock
 from fishd.core.errors import StartupError
 from fishd.core.schema import Reading
@@ -178,6 +179,8 @@ def scripted(clock: Any, act: Callable[[], Any], **options: Any) -> SampledReadi
         ({"flow": 1.0}, {"flow": 1.0}, "", ""),
         (None, {}, "", ""),
         ({"speed": 1.0}, {}, "ValueError: it gives speed, but declares flow, depth", ""),
+        ({5: 1.0}, {}, "ValueError: it gives 5, but declares flow, depth", ""),
+        ({"x" * 10**6: 1.0}, {}, "ValueError: it gives xxx", ""),
         ({"flow": "much"}, {}, "ValueError: flow is of type str, not one real number", ""),
         (3.0, {}, "AttributeError: ", ""),
     ],
@@ -190,6 +193,7 @@ def test_what_a_driver_returns_is_checked(
     assert values(sensor, clock) == expected
     assert (sensor.trouble or "").startswith(trouble)
     assert bool(sensor.trouble) == bool(trouble)
+    assert len(sensor.trouble or "") < 150
     assert "".join(sensor.doubts.values()).startswith(doubt)
 
 
@@ -208,6 +212,7 @@ class Raising:
     [
         (["it drifts\n", "it ages"], ("it drifts", "it ages")),
         ("it drifts", ("it drifts",)),
+        (["no" * 10**6], (text.line("no" * 10**6, 300),)),
         (["it drifts"] * 10**6, ("it drifts",) * 16),
         (None, ("Odd cannot name its limitations: TypeError: 'NoneType' object is not iterable",)),
         ([5], ("Odd cannot name its limitations: TypeError: object of type 'int' has no len()",)),
@@ -229,6 +234,18 @@ def test_what_a_driver_says_of_itself_never_ends_fishd(
     assert values(sensor, clock) == {}  # it has no `act`
     sensor._driver.act = lambda: {"flow": 1.0}  # type: ignore[attr-defined]
     assert values(sensor, clock) == {"flow": 1.0}
+
+
+@pytest.mark.parametrize("explained", ["broken\n" * 10**5, 5])
+def test_what_a_driver_explains_is_one_short_line(explained: Any) -> None:
+    clock = VirtualClock()
+    sensor = scripted(clock, lambda: 1 / 0)
+    sensor._driver.explain = lambda error: explained  # type: ignore[method-assign]
+    values(sensor, clock)
+    assert sensor.trouble
+    assert len(sensor.trouble) <= 300
+    assert "\n" not in sensor.trouble
+    assert sensor.trouble.startswith("broken" if explained != 5 else "ZeroDivisionError: ")
 
 
 @pytest.mark.parametrize("error", [SystemExit(4), ValueError("no")])
