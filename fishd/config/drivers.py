@@ -5,6 +5,7 @@ The name is that of a driver, or of the plant; other packages may add drivers an
 
 import math
 import re
+import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
@@ -39,6 +40,10 @@ SENSOR_SECTIONS = "sensors"
 """Section whose keys are the names of sensors; each contains a section."""
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 """Permitted names of sensors and of readings."""
+MAX_READINGS = 64
+"""Largest number of readings of a sensor."""
+MAX_DESCRIPTION_CHARACTERS = 200
+"""Largest length of a reading's unit and of its description [characters]."""
 
 
 class Choice(NamedTuple):
@@ -201,12 +206,22 @@ def check_readings(sensors: Mapping[str, SensorSettings]) -> None:
             why = text.describe_error(error)
             raise Problem(path, f"kind '{settings.kind}' cannot declare readings: {why}") from error
         remedy = f"another name is needed, as in {'.'.join(path)}.rename"
+        if len(readings) > MAX_READINGS:
+            raise Problem(path, f"{len(readings)} readings are not valid: at most {MAX_READINGS}")
         for name, reading in readings.items():
-            if not isinstance(reading, Reading) or not _NAME.fullmatch(name):
+            named = isinstance(name, str) and _NAME.fullmatch(name)
+            if not isinstance(reading, Reading) or not named:
                 raise Problem(
                     path,
-                    f"its reading '{text.quoted(name)}' is not valid: a name of a to z, 0 to 9 and "
-                    "_, with a Reading, is needed",
+                    f"its reading '{text.quoted(str(name))}' is not valid: a name of a to z, 0 to "
+                    "9 and _, with a Reading, is needed",
+                )
+            if not _can_be_shown(reading):
+                raise Problem(
+                    path,
+                    f"its reading {name} is not valid: a unit and a description of up to "
+                    f"{MAX_DESCRIPTION_CHARACTERS} printable characters, and finite numbers or "
+                    "None as low and high, are needed",
                 )
             if name in owners:
                 raise Problem(
@@ -217,6 +232,19 @@ def check_readings(sensors: Mapping[str, SensorSettings]) -> None:
             if new not in readings:
                 known = suggest(old, list(readings), listed="it has")
                 raise Problem((*path, "rename", old), f"is not one of its readings; {known}")
+
+
+def _can_be_shown(reading: Reading) -> bool:
+    """Return whether texts and limits of a reading, which another package made, are valid."""
+    texts: tuple[Any, ...] = (reading.unit, reading.description)
+    limits: tuple[Any, ...] = (reading.low, reading.high)
+    return all(
+        isinstance(words, str) and len(words) <= MAX_DESCRIPTION_CHARACTERS and words.isprintable()
+        for words in texts
+    ) and all(
+        limit is None or (isinstance(limit, int | float) and abs(limit) <= sys.float_info.max)
+        for limit in limits
+    )
 
 
 def check_plant(plant: PlantParameters) -> None:

@@ -1,11 +1,14 @@
 """Any number of sensors in the configuration, and their readings on a simulated fish."""
 
+import math
 import sys
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 from rigs.harness import Rig
 
 from fishd.assembly import assemble
@@ -13,7 +16,10 @@ from fishd.config import adopt, load
 from fishd.config.mistakes import find
 from fishd.core.clock import VirtualClock
 from fishd.core.errors import ConfigError, MissingPackage
+from fishd.core.schema import Reading
+from fishd.hardware.sensors.simulated import Simulated
 
+FLOW = Reading("m/s", "Flow.")
 WATER = "sensors.water={kind: ds18b20}"
 
 
@@ -84,6 +90,37 @@ def test_a_wrong_sensor_is_refused_in_one_line(overrides: list[str], complaint: 
     with pytest.raises(ConfigError) as caught:
         load(None, overrides)
     assert str(caught.value).endswith(complaint)
+
+
+@pytest.mark.parametrize(
+    ("declared", "complaint"),
+    [
+        ({5: FLOW}, "its reading '5' is not valid: a name of a to z, 0 to 9 and _, with a Reading"),
+        ({"flow": 5}, "its reading 'flow' is not valid: a name of a to z, 0 to 9 and _, with a "),
+        ({f"flow_{n}": FLOW for n in range(65)}, "65 readings are not valid: at most 64"),
+        (None, "kind 'simulated' cannot declare readings: AttributeError: 'NoneType' object has "),
+        *(
+            ({"flow": replace(FLOW, **wrong)}, "its reading flow is not valid: a unit and a desc")
+            for wrong in (
+                {"low": math.nan},
+                {"high": math.inf},
+                {"low": "1"},
+                {"unit": None},
+                {"description": "x" * 10**6},
+                {"description": "two\nlines"},
+            )
+        ),
+    ],
+)
+def test_readings_that_a_driver_must_not_declare_are_refused_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, declared: Any, complaint: str
+) -> None:
+    monkeypatch.setattr(Simulated, "declare", lambda settings: declared)
+    with pytest.raises(ConfigError) as caught:
+        load(None, ["sensors.a.kind=simulated"])
+    line = str(caught.value)
+    assert f"sensors.a: {complaint}" in line
+    assert "\n" not in line
 
 
 def test_every_wrong_sensor_of_a_file_is_found(tmp_path: Path) -> None:
