@@ -98,8 +98,10 @@ class SampledReadings(SampledPart[Mapping[str, float]]):
 
     def _take(self, values: Mapping[str, float], now: float) -> None:
         """Keep the values of a sample, each as the mean over the latest tick."""
-        latest, doubts = dict(self._latest), dict(self.doubts)
-        for own_name, value in values.items():
+        latest, doubts, items = dict(self._latest), dict(self.doubts), values.items()
+        if (count := len(items)) > len(self.declared):
+            raise ValueError(f"it gives {count} readings, but declares {len(self.declared)}")
+        for own_name, value in items:
             name = self._names.get(own_name, own_name)
             if name not in self.declared:
                 named = text.quoted(str(name))

@@ -179,6 +179,12 @@ def scripted(clock: Any, act: Callable[[], Any], **options: Any) -> SampledReadi
         ({"flow": 1.0}, {"flow": 1.0}, "", ""),
         (None, {}, "", ""),
         ({"speed": 1.0}, {}, "ValueError: it gives speed, but declares flow, depth", ""),
+        (
+            {"flow": 1.0, "depth": 2.0} | dict.fromkeys(range(10**5), 3.0),
+            {},
+            "ValueError: it gives 100002 readings, but declares 2",
+            "",
+        ),
         ({5: 1.0}, {}, "ValueError: it gives 5, but declares flow, depth", ""),
         ({"x" * 10**6: 1.0}, {}, "ValueError: it gives xxx", ""),
         ({"flow": "much"}, {}, "ValueError: flow is of type str, not one real number", ""),
