@@ -246,8 +246,8 @@ class SensorDriver(SampledDriver[R]):
     def sample(self) -> Mapping[str, float] | None:
         """Return the values of the readings by name, or None if there are none yet.
 
-        One that is missing or NaN keeps its latest value, and grows old. It runs in a thread of its
-        own, so it may wait. May raise any exception; see `SampledDriver.sample`.
+        One that is missing, NaN or beyond ±1e100 keeps its latest value, and grows old. It runs in
+        a thread of its own, so it may wait. May raise any exception; see `SampledDriver.sample`.
         """
 
     def close(self) -> None:

@@ -18,6 +18,8 @@ MIN_PERIOD_S = 5e-3
 """Shortest default of the time between two samples, which leaves a bus to the forces [s]."""
 MIN_STALE_PERIODS, MIN_STALE_TICKS = 3.0, 2.0
 """Ages from which a reading is old, of which the longer one counts."""
+MAX_VALUE = 1e100
+"""Largest size of a value: sums of such values and of their squares are finite."""
 _MAX_WAIT_S = 0.05
 """Longest wait of the thread before it looks again whether a sample is due [s]."""
 
@@ -107,8 +109,8 @@ class SampledReadings(SampledPart[Mapping[str, float]]):
                 named = text.quoted(str(name))
                 raise ValueError(f"it gives {named}, but declares {', '.join(self.declared)}")
             number = real_number(value, name)
-            if not math.isfinite(number):
-                doubts[name] = f"{name} is not a number"
+            if not abs(number) <= MAX_VALUE:
+                doubts[name] = f"{name} is {'not' if math.isnan(number) else 'too large'} a number"
                 continue
             before = self._samples.get(name, ())
             # A sample that is a tick old is no part of the mean; half a period is for rounding.

@@ -177,6 +177,8 @@ def scripted(clock: Any, act: Callable[[], Any], **options: Any) -> SampledReadi
         ({"flow": 1.0, "depth": math.nan}, {"flow": 1.0}, "", "depth is not a number"),
         ({"flow": 99.0, "depth": 1}, {"flow": 99.0, "depth": 1.0}, "", "flow is 99 m/s, more than"),
         ({"flow": 1.0}, {"flow": 1.0}, "", ""),
+        ({"flow": 1.0, "depth": 1e308}, {"flow": 1.0}, "", "depth is too large a number"),
+        ({"flow": 1.0, "depth": -math.inf}, {"flow": 1.0}, "", "depth is too large a number"),
         (None, {}, "", ""),
         ({"speed": 1.0}, {}, "ValueError: it gives speed, but declares flow, depth", ""),
         (
