@@ -5,7 +5,6 @@ The name is that of a driver, or of the plant; other packages may add drivers an
 
 import math
 import re
-import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
@@ -242,7 +241,7 @@ def _can_be_shown(reading: Reading) -> bool:
         isinstance(words, str) and len(words) <= MAX_DESCRIPTION_CHARACTERS and words.isprintable()
         for words in texts
     ) and all(
-        limit is None or (isinstance(limit, int | float) and abs(limit) <= sys.float_info.max)
+        limit is None or (isinstance(limit, int | float) and abs(limit) < 1e308)
         for limit in limits
     )
 
