@@ -241,8 +241,7 @@ def _can_be_shown(reading: Reading) -> bool:
         isinstance(words, str) and len(words) <= MAX_DESCRIPTION_CHARACTERS and words.isprintable()
         for words in texts
     ) and all(
-        limit is None or (isinstance(limit, int | float) and abs(limit) < 1e308)
-        for limit in limits
+        limit is None or (isinstance(limit, int | float) and abs(limit) < 1e308) for limit in limits
     )
 
 
