@@ -348,7 +348,8 @@ def _read_results(path: Path) -> Iterable[Mapping[str, Any]]:
             results = msgspec.json.decode(content, type=list[dict[str, Any]] | dict[str, Any])
         except msgspec.DecodeError as error:
             raise FileProblem(f"not a result: {text.line(str(error))}") from None
-        return results if isinstance(results, list) else [results]
+        if results:  # otherwise it was interrupted
+            return results if isinstance(results, list) else [results]
     try:
         head, *rows = tables.read(path / ROWS, MAX_TABLE_BYTES) or [[]]
         return [dict(zip(head, row, strict=False)) for row in rows]
