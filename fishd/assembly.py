@@ -93,7 +93,10 @@ def open_fish(config: Config) -> Any:
     Raises `MissingPackage`, and `StartupError` where a robot of another package cannot start.
     """
     try:
-        return call_foreign(config.kind.open, config) or simulated_fish(config)
+        fish = call_foreign(config.kind.open, config)
+        if fish is not None and not callable(getattr(fish, "robot", None)):
+            raise TypeError(f"open returned {text.quoted(repr(fish))}, which has no method robot")
+        return fish or simulated_fish(config)
     except FishdError:
         raise
     except Exception as error:

@@ -170,6 +170,8 @@ class Run:
         self._command = kept_arguments(context)
         self._stack = ExitStack()
         self._session: Session | None = None
+        self._has_begun = False
+        """Whether it has printed which fish it is about."""
         self._experiment: Experiment | None = None
 
     def __enter__(self) -> Self:
@@ -210,7 +212,7 @@ class Run:
         return self._experiment
 
     def open(self, settings: dict[str, Any], cluster: str | None = None) -> None:
-        """Begin or resume the experiment in its folder, and print which fish it is about.
+        """Begin or resume the experiment in its folder.
 
         In simulation nothing is kept, unless the verb keeps it or `--folder` is given.
 
@@ -238,11 +240,17 @@ class Run:
                 open_experiment(self.folder, header, resume=self.is_resumed)
             )
             self.ending = Ending(self._experiment, cluster)
-        self.echo(f"fish: {self.fish}")
 
-    def echo(self, line: str) -> None:
-        """Print a line, on standard error if the output is JSON."""
-        echo(line, err=self.as_json)
+    def echo(self, line: str = "") -> None:
+        """Print a line, and before the first one which fish it is about.
+
+        If the output is JSON, it is on standard error.
+        """
+        if not self._has_begun:
+            self._has_begun = True
+            echo(f"fish: {self.fish}", err=self.as_json)
+        if line:
+            echo(line, err=self.as_json)
 
     @contextmanager
     def swimming(
@@ -265,6 +273,7 @@ class Run:
         """
         from fishd.lab.swim_log import SwimLog
 
+        self.echo()
         session, experiment, began = self._session, self._experiment, False
         with self.ending.measuring(), ExitStack() as stack:
             if session:

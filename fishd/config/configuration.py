@@ -42,9 +42,10 @@ from fishd.config.drivers import (
 )
 from fishd.controllers import registry
 from fishd.controllers.base import DEFAULT_DWELL_S, MAX_DWELL_S, ChatterSettings, Controller, Limits
-from fishd.core import robots, strict_yaml
+from fishd.core import robots, strict_yaml, text
 from fishd.core.errors import ConfigError
 from fishd.core.estimation import EstimatorSettings
+from fishd.core.foreign_code import call_foreign
 from fishd.core.loop_settings import LoopSettings
 from fishd.core.overrides import apply_overrides
 from fishd.core.protocol import DEFAULT_LEASE_S, MAX_LEASE_S, MIN_LEASE_S
@@ -392,9 +393,20 @@ CHECKS: tuple[Check, ...] = (
     lambda c: check_lockstep(c.robot, c.lockstep),
     lambda c: check_estimator(c.robot, c.estimator.kind, c.plant),
     lambda c: check_virtual_pi(c.virtual_pi),
-    lambda c: c.kind.check(c),
+    lambda c: _check_robot(c),
 )
 """Checks of keys against each other, in order; each raises `Problem`."""
+
+
+def _check_robot(config: Config) -> None:
+    """Let the robot, which may be of another package, check the configuration."""
+    try:
+        call_foreign(config.kind.check, config)
+    except Problem:
+        raise
+    except Exception as error:
+        why = text.describe_error(error)
+        raise Problem(("robot",), f"the check of '{config.robot}' failed: {why}") from error
 
 
 def adopt(data: dict[str, Any], overrides: Iterable[str] = ()) -> Config:

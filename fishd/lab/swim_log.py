@@ -1,5 +1,6 @@
 """Log of the swims and rests that an experiment on a live fish has finished, to resume it."""
 
+import logging
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from fishd.core.errors import FishdError, RecordingError
+from fishd.core.errors import ConfigError, FishdError, RecordingError
 from fishd.core.signals import Tick
 from fishd.lab.experiment import Experiment
 from fishd.lab.session import Replaced, concerns_one_controller
@@ -16,10 +17,13 @@ from fishd.recording.part_file import PART_SUFFIX
 from fishd.recording.reader import open_run
 from fishd.recording.writer import RunWriter
 
+log = logging.getLogger(__name__)
+
 REQUEST_COLUMNS = ("controller", "parameters", "seconds")
 """Columns of what the experiment requested; a rest has no controller."""
 SWIMS = "swims.csv"
-COLUMNS = (*REQUEST_COLUMNS, "failure", "ticks", "first_tick", "last_tick", "recording")
+TICK_COLUMNS = ("ticks", "first_tick", "last_tick")
+COLUMNS = (*REQUEST_COLUMNS, "failure", *TICK_COLUMNS, "recording")
 
 
 class SwimLog:
@@ -49,16 +53,22 @@ class SwimLog:
         self._passed = 0
         """Number of these that this session has requested."""
         read_ticks = cache(_read_ticks)
-        for row in rows:
+        for number, row in enumerate(rows, 2):
             ticks = []
             if not row["failure"]:
-                first, last = int(row["first_tick"]), int(row["last_tick"])
-                recorded = read_ticks(experiment.path / row["recording"])
+                try:
+                    count, first, last = (int(row[name]) for name in TICK_COLUMNS)
+                    recorded = read_ticks(experiment.path / row["recording"])
+                except ValueError as error:  # that of a path contains a zero byte
+                    raise ConfigError(
+                        f"{experiment.path / SWIMS}:{number}: {error}; delete this line and those "
+                        "after it, to measure these swims again"
+                    ) from None
                 ticks = [tick for tick in recorded if first <= tick.seq <= last]
-                if len(ticks) < int(row["ticks"]):  # the computer lost power
+                if len(ticks) < count:  # the computer lost power
                     break
             self._finished.append((row, ticks))
-        self._drop_after(len(self._finished))
+        self._drop_after(len(self._finished), len(rows), f"{SWIMS} has ticks that no recording has")
 
     def swim(
         self,
@@ -86,7 +96,7 @@ class SwimLog:
                 if row["failure"]:
                     raise Replaced(row["failure"])
                 return self._in_order(ticks)
-            self._drop_after(self._passed)
+            self._drop_after(self._passed, len(self._finished), "other swims are requested")
         try:
             ticks = swim()
         except FishdError as error:
@@ -97,7 +107,10 @@ class SwimLog:
         self._add(request, ticks=len(ticks), first_tick=ticks[0].seq, last_tick=ticks[-1].seq)
         return self._in_order(ticks)
 
-    def _drop_after(self, count: int) -> None:
+    def _drop_after(self, count: int, known: int, why: str) -> None:
+        """Drop the rows after so many of those that are known, and say so: they are swum again."""
+        if known > count:
+            log.warning("%s: %d swims and rests of the log are swum again", why, known - count)
         del self._finished[count:]
         self._table.replace([row for row, _ in self._finished])
 

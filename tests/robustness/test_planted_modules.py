@@ -15,7 +15,7 @@ from fishd.client import Fish, NoDaemon
 NAMES = sorted({*sys.stdlib_module_names, *importlib.metadata.packages_distributions(), "fishd"})
 STARTS_PROCESSES = (
     r"^ *(import|from) (joblib|multiprocessing|concurrent|torch.multiprocessing)\b"
-    r"(?!\.futures import (Future, )?ThreadPoolExecutor(, wait)?$)|SubprocVecEnv\("
+    r"(?!\.futures import ((Future, )?ThreadPoolExecutor(, wait)?|CancelledError)$)|SubprocVecEnv\("
 )
 """Pattern of code that starts Python processes; threads are none."""
 

@@ -35,7 +35,7 @@ EXTREMES = {"fx_min", "fx_max", "fy_min", "fy_max"}  # absent with a simulated f
 SWIMMER_FIELDS = {"x", "y", "speed", "heading"}
 THRUST_FIELDS = {"thrust_ci95", "thrust_factor", "thrust_factor_ci95"}
 """Fields that are present after the first rest."""
-OPTIONAL_FIELDS = THRUST_FIELDS | {"quantities", "leak", "fy_corrected", "suspect"}
+OPTIONAL_FIELDS = THRUST_FIELDS | {"quantities", "readings", "leak", "fy_corrected", "suspect"}
 """Fields that are absent without a value."""
 TICK_FIELDS = {
     name: kind if isinstance(kind, type) else float

@@ -183,7 +183,7 @@ def test_an_answer_of_pigpiod_that_is_late_just_then_keeps_no_tail_from_neutral(
             widths.append(bench.width)
 
         shown, robot = SimpleNamespace(on=True), SimpleNamespace(servo=Thawing())
-        loop: Any = SimpleNamespace(servo=shown, applied=0.5, robot=robot)
+        loop: Any = SimpleNamespace(servo=shown, instruction_angle=0.5, robot=robot)
 
         async def move_to_neutral() -> None:
             daemon = DaemonInProcess(Config(lockstep=True), print_status=False)

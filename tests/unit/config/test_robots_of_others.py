@@ -56,13 +56,25 @@ class Broken(RobotKind):
     @staticmethod
     def open(config):
         raise SystemExit("no cable")
+
+class Leaving(RobotKind):
+    @staticmethod
+    def check(config):
+        raise SystemExit(0)
+
+class Five(RobotKind):
+    @staticmethod
+    def open(config):
+        return 5
 """
+
+KINDS = ("twin", "drifter", "broken", "leaving", "five")
 
 
 @pytest.fixture(autouse=True)
 def _installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     module = f"robots_{tmp_path.name}"  # of this test alone
-    classes = {name: f"{module}:{name.capitalize()}" for name in ("twin", "drifter", "broken")}
+    classes = {name: f"{module}:{name.capitalize()}" for name in KINDS}
     install(tmp_path, {module: CODE}, group="fishd.robots", **classes)
     monkeypatch.syspath_prepend(str(tmp_path))
     forget_drivers()
@@ -97,6 +109,7 @@ def test_a_robot_of_another_package_swims_with_its_settings_and_its_name() -> No
         (["robot=twin", "robot_settings.gain=2"], "robot_settings.gain: 2 is not valid: a number"),
         (["robot=twin", "robot_settings.gian=1"], "robot_settings.gian: unknown key"),
         (["robot=twin", "tick=0.01"], "tick: its link is too slow: 0.02 s is needed"),
+        (["robot=leaving"], "robot: the check of 'leaving' failed: SystemExit"),
         (["robot_settings.gain=0.1"], "robot_settings.gain: unknown key"),
     ],
 )
@@ -111,6 +124,8 @@ def test_one_that_cannot_be_used_is_one_line(settings: list[str], complaint: str
 def test_one_that_cannot_start_says_why_and_one_that_is_free_has_no_thrust() -> None:
     with pytest.raises(StartupError, match=r"^robot 'broken' cannot start: SystemExit: no cable$"):
         VirtualRun(load(None, ["robot=broken"]), None)
+    with pytest.raises(StartupError, match=r"^robot 'five' cannot start: .*open returned 5, which"):
+        VirtualRun(load(None, ["robot=five"]), None)
     with pytest.raises(ConfigError, match=r"^robot: drifter is not valid for optimum, which needs"):
         check_tethered("drifter", "optimum")
     assert "twin" in json_schema()["$defs"]["Config"]["properties"]["robot"]["enum"]

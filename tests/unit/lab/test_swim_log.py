@@ -3,7 +3,10 @@
 import csv
 from pathlib import Path
 
+import pytest
+
 from fishd.config import Config
+from fishd.core.errors import ConfigError
 from fishd.core.signals import Tick
 from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.session import VirtualSession
@@ -41,3 +44,31 @@ def test_swims_are_taken_from_the_log_until_another_one_is_requested(tmp_path: P
     longer = swim(path, 1.0, 1.5, 2.0)
     assert longer[:2] == changed
     assert len(rows(path)) == 3
+
+
+def test_swims_whose_ticks_are_lost_are_swum_again_and_that_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "run"
+    swim(path, 1.0, 2.0)
+    for recording in path.glob("*.mcap*"):
+        recording.unlink()
+    swim(path, 1.0)
+    said = "swims.csv has ticks that no recording has: 2 swims and rests of the log are swum again"
+    assert said in caplog.text
+
+
+@pytest.mark.parametrize(("column", "value"), [("first_tick", "xx"), ("recording", "a\0b")])
+def test_a_damaged_row_is_one_line_with_its_number(tmp_path: Path, column: str, value: str) -> None:
+    path = tmp_path / "run"
+    swim(path, 1.0)
+    table = list(csv.DictReader((path / SWIMS).read_text().splitlines()))
+    table[0][column] = value
+    text = "".join(f"{','.join(map(_quoted, line))}\n" for line in (table[0], table[0].values()))
+    (path / SWIMS).write_text(text)
+    with pytest.raises(ConfigError, match=r"swims\.csv:2: .*; delete this line and those after it"):
+        swim(path, 1.0)
+
+
+def _quoted(cell: str) -> str:
+    return '"' + cell.replace('"', '""') + '"'
