@@ -272,7 +272,7 @@ class Config(LoopSettings, frozen=True, forbid_unknown_fields=True, kw_only=True
         readings = self._modelled
         for settings in self.sensors.values():
             readings |= readings_of(settings)
-        return readings
+        return readings | self._modelled
 
     @property
     def _modelled(self) -> dict[str, Reading]:

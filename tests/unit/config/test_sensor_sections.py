@@ -150,6 +150,7 @@ def test_only_the_reading_that_has_a_model_is_replaced_in_a_sensor_with_others()
     assert readings == {"power": pytest.approx(0.06)} | dict.fromkeys(
         ("acceleration_x", "acceleration_y", "acceleration_z", "rotation_y", "rotation_z"), 0.0
     )
+    assert rig.config.readings == rig.loop.readings.declared
     assert rig.loop.robot.limitations() == (
         "sensors.imu is simulated, as the fish is: its power is that of a model, its other "
         "readings are constant",
