@@ -3,7 +3,7 @@
 import dataclasses
 import logging
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -327,13 +327,13 @@ def _do_nothing() -> None:
 
 
 def _open_sensors(
-    config: Config, clock: Clock, *, threaded: bool, modelled: Iterable[str] = ()
+    config: Config, clock: Clock, *, threaded: bool, modelled: Container[str] = ()
 ) -> "tuple[SampledReadings, ...]":
     """Return the configured sensors; they need not answer yet.
 
     A simulated fish has stand-ins for those that need hardware.
 
-    modelled: readings that the fish has a model of; a sensor with one of them is left out
+    modelled: readings that the fish has a model of, and that no sensor replaces
     Raises `StartupError` when a package is missing.
     """
     if not config.sensors:
@@ -344,10 +344,10 @@ def _open_sensors(
     sensors = []
     for name, settings in config.sensors.items():
         kind, readings = SENSORS.find(settings.kind), readings_of(settings)
-        if readings.keys() & modelled:
-            continue
-        if not (config.kind.has_hardware or kind.is_simulated):
-            kind = StandIn.of(kind)
+        replaced = [reading for reading in readings if reading in modelled]
+        if replaced or not (config.kind.has_hardware or kind.is_simulated):
+            kind = StandIn.of(kind, replaced)
+            readings = {name: readings[name] for name in readings if name not in replaced}
         with driver_packages(settings.kind):
             period = sample_period(kind, settings, config.tick)
             driver = kind(settings, clock, period, f"sensors.{name}")

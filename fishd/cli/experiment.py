@@ -327,14 +327,14 @@ class Run:
 
 def experiment_options(
     *others: Callable[[Any], Any],
-    plot: str,
+    plot: str | None = None,
     keeps_simulations: bool = False,
     live_config: bool = False,
 ) -> Callable[[F], F]:
     """Return a decorator that adds the options of each experiment, passed as `run`, and others.
 
     others: options of the verb itself, in the order of its help
-    plot: what its picture shows
+    plot: what its picture shows; None for a verb without one, which has no `--plot`
     keeps_simulations: whether a simulation has a folder by default, with a picture
     live_config: whether `--config` and `--set` apply to a live fish, too
     """
@@ -349,8 +349,8 @@ def experiment_options(
             endpoint: str | None,
             folder: Path | None,
             resume: Path | None,
-            picture: Path | None,
             as_json: bool,
+            picture: Path | None = None,
             **values: Any,
         ) -> Any:
             if on is None and resume:
@@ -372,7 +372,7 @@ def experiment_options(
         config = f"{scope}YAML file of the fish, as for fishd. [default: the defaults]"
         for option in (
             json_option,
-            plot_option(plot),
+            *([plot_option(plot)] if plot else []),
             take_option,
             endpoint_option,
             set_option,

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from msgspec.structs import asdict
 
 from fishd.cli.config import fish_options
 from fishd.cli.options import for_option, json_option
@@ -26,11 +27,14 @@ from fishd.cli.swimmer.simulation import (
 )
 from fishd.config import Config, load
 from fishd.core.console import format_power
+from fishd.core.robots import RobotKind
 
 if TYPE_CHECKING:
     from fishd.lab.simulation import Report, VirtualRun
     from fishd.recording import RunWriter
 
+_OF_BEST_SQUARE = ("relative_thrust", "best_square_thrust", "best_square_frequency")
+"""Fields of a report that depend on the best square wave."""
 _ROUNDING_NOTE = (
     "(pigpiod sends pulses in steps of 5 µs, so that the tail swings a little more than ±Φ)"
 )
@@ -100,10 +104,12 @@ def _simulate(
             return swim(run_arguments, free_swim, as_json)
         report = run(config, name, parameters, seconds, settle, writer, on_start)
     check_whole_beat(report, seconds, settle)
+    has_best = config.kind.open is RobotKind.open  # otherwise the fish is not that of section plant
     if as_json:
-        print_json(report)
+        values = asdict(report)
+        print_json({key: values[key] for key in values if has_best or key not in _OF_BEST_SQUARE})
     else:
-        echo_rows(_rows(report, config, settle))
+        echo_rows(_rows(report, config, settle, has_best))
     warn_of_fin(report.fin_amplitude)
     if report.fallback:
         echo(f"fishctl: another controller took over: {report.fallback.message}", err=True)
@@ -127,7 +133,8 @@ def _open_recording(path: Path) -> "RunWriter":
     return RunWriter(path, source="simulation")
 
 
-def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, str]]:
+def _rows(report: "Report", config: Config, settle: float, has_best: bool) -> list[tuple[str, str]]:
+    """Return names and values; has_best: whether the best square wave of the fish is known."""
     best = f"{report.best_square_thrust * 1e3:.3f} mN at {report.best_square_frequency:.3f} Hz"
     return [
         (
@@ -145,11 +152,18 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
             f"{report.fullness:.1%} of ±{report.amplitude:g} rad on average, "
             f"form factor {report.form_factor:.3f}",
         ),
-        (
-            "relative thrust",
-            f"{report.relative_thrust:.1%} of the best square wave at ±{report.amplitude:g} rad",
+        *(
+            [
+                (
+                    "relative thrust",
+                    f"{report.relative_thrust:.1%} of the best square wave at "
+                    f"±{report.amplitude:g} rad",
+                ),
+                ("", f"({best}, where half beats need not be whole ticks)"),
+            ]
+            if has_best
+            else []
         ),
-        ("", f"({best}, where half beats need not be whole ticks)"),
         *([("", _ROUNDING_NOTE)] if config.kind.is_virtual else []),
         (
             "timing",

@@ -108,7 +108,8 @@ def _reading_rows(status: Status) -> list[tuple[str, str]]:
         shown = "–" if reading.value is None else format_reading(reading)
         age = reading.age or 0.0
         shown += f" ({age:.0f} s old)" if age >= 2.0 else ""
-        rows.setdefault(reading.sensor, []).append(f"{name} {shown}")
+        label = "" if name == reading.sensor else f"{name} "  # not "power  power 694 mW"
+        rows.setdefault(reading.sensor, []).append(f"{label}{shown}")
     return [(sensor, ", ".join(values)) for sensor, values in rows.items()]
 
 

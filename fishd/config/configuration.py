@@ -269,11 +269,16 @@ class Config(LoopSettings, frozen=True, forbid_unknown_fields=True, kw_only=True
     @property
     def readings(self) -> dict[str, Reading]:
         """Readings of all sensors by name."""
-        has_model = not self.kind.has_hardware and self.kind.is_tethered
-        readings = {"power": POWER} if has_model and self.plant.model == TETHERED else {}
+        readings = self._modelled
         for settings in self.sensors.values():
             readings |= readings_of(settings)
-        return readings
+        return readings | self._modelled
+
+    @property
+    def _modelled(self) -> dict[str, Reading]:
+        """Readings that the model of a simulated fish gives."""
+        has_model = not self.kind.has_hardware and self.kind.is_tethered
+        return {"power": POWER} if has_model and self.plant.model == TETHERED else {}
 
     @property
     def limits(self) -> Limits:
@@ -370,7 +375,7 @@ Check = Callable[[Config], None]
 
 CHECKS: tuple[Check, ...] = (
     lambda c: check_robot(c.robot, c.robot_settings),
-    lambda c: check_readings(c.sensors),
+    lambda c: check_readings(c.sensors, c._modelled, c.tick),
     lambda c: check_start(c.start.controller, c.start.parameters, c.limits),
     lambda c: check_addresses(c.telemetry.address, c.control.address),
     lambda c: (

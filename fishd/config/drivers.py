@@ -5,7 +5,7 @@ The name is that of a driver, or of the plant; other packages may add drivers an
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple
@@ -192,8 +192,14 @@ def readings_of(settings: SensorSettings) -> dict[str, Reading]:
     return {settings.rename.get(name, name): reading for name, reading in declared.items()}
 
 
-def check_readings(sensors: Mapping[str, SensorSettings]) -> None:
-    """Check that each reading has a valid name of its own."""
+def check_readings(
+    sensors: Mapping[str, SensorSettings], modelled: Iterable[str], tick: float
+) -> None:
+    """Check that each reading has a valid name of its own, possible limits and a possible age.
+
+    modelled: readings of the model of a simulated fish, which replace those of hardware
+    tick: period of the loop [s]
+    """
     owners = dict.fromkeys((*Tick.__struct_fields__, "elapsed"), "a column of every tick")
     for sensor, settings in sensors.items():
         path = (SENSOR_SECTIONS, sensor)
@@ -204,6 +210,19 @@ def check_readings(sensors: Mapping[str, SensorSettings]) -> None:
         except Exception as error:
             why = text.describe_error(error)
             raise Problem(path, f"kind '{settings.kind}' cannot declare readings: {why}") from error
+        kind = find_driver(SENSOR_SECTIONS, settings.kind)
+        if kind.is_simulated:
+            owners = dict.fromkeys(modelled, "a reading of the simulated fish") | owners
+        if settings.stale_after is not None:
+            from fishd.hardware.sensors.sampled_readings import sample_period
+
+            period = sample_period(kind, settings, tick)
+            if settings.stale_after <= period:
+                raise Problem(
+                    (*path, "stale_after"),
+                    f"{settings.stale_after:g} is not valid: a time longer than its period of "
+                    f"{period:g} s is needed",
+                )
         remedy = f"another name is needed, as in {'.'.join(path)}.rename"
         if len(readings) > MAX_READINGS:
             raise Problem(path, f"{len(readings)} readings are not valid: at most {MAX_READINGS}")
@@ -226,6 +245,10 @@ def check_readings(sensors: Mapping[str, SensorSettings]) -> None:
                 raise Problem(
                     path, f"its reading {name} is the name of {owners[name]} already: {remedy}"
                 )
+            low, high = reading.low, reading.high
+            if low is not None and high is not None and low > high:
+                what = f"{low:g} is not valid: at most {high:g}, its high, is needed"
+                raise Problem((*path, "low"), what)
             owners[name] = f"a reading of {'.'.join(path)}"
         for old, new in settings.rename.items():
             if new not in readings:

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 UPDATE_BUDGET = 0.5
 """Largest fraction of the period that an update of the controller may take."""
-SETTLE_TIME_S = 0.1
+AT_NEUTRAL_TIME_S = 0.1
 """Time that a servo stays at neutral before its pulses end [s]."""
 
 
@@ -113,8 +113,8 @@ class ControlLoop:
 
     @property
     def has_settled(self) -> bool:
-        """Whether the servo has been at neutral for `SETTLE_TIME_S`, so that its pulses may end."""
-        return self.neutral_for >= SETTLE_TIME_S - 1e-9
+        """Whether the servo was at neutral for `AT_NEUTRAL_TIME_S`, so that its pulses may end."""
+        return self.neutral_for >= AT_NEUTRAL_TIME_S - 1e-9
 
     def tick(self, slot: Slot) -> None:
         """Run one tick of the loop."""

@@ -17,7 +17,7 @@ import click
 from fishd import __version__, assembly
 from fishd.config import Config, load
 from fishd.control.lease import Lease
-from fishd.control.loop import SETTLE_TIME_S
+from fishd.control.loop import AT_NEUTRAL_TIME_S
 from fishd.control.supervisor import Mode
 from fishd.controllers import registry
 from fishd.controllers.policy.runtime import preload
@@ -189,7 +189,7 @@ class Daemon:
                 return
             log.info("stopping: fading to neutral")
             self._loop.stop()
-            deadline = self._clock.monotonic() + MAX_FADE_S + SETTLE_TIME_S
+            deadline = self._clock.monotonic() + MAX_FADE_S + AT_NEUTRAL_TIME_S
             async for slot in ticker:
                 if self._loop.has_settled or slot.now > deadline:
                     break

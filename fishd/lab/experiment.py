@@ -23,10 +23,10 @@ from fishd.core.files import FileProblem, write_atomically
 from fishd.core.process.lockfile import LockHeld, NotALock, find_lock_holder, locked
 from fishd.lab import tables
 from fishd.lab.tables import Table
-from fishd.recording.folder import runs_folder
+from fishd.recording.folder import EXPERIMENT, runs_folder
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX
 
-HEADER, ROWS, RESULT = "experiment.json", "rows.csv", "result.json"
+HEADER, ROWS, RESULT = EXPERIMENT, "rows.csv", "result.json"
 LOCK = "experiment"
 """File of a folder whose lock is held while something is measured there."""
 MAX_TABLE_BYTES = 256 * 2**20
@@ -348,7 +348,8 @@ def _read_results(path: Path) -> Iterable[Mapping[str, Any]]:
             results = msgspec.json.decode(content, type=list[dict[str, Any]] | dict[str, Any])
         except msgspec.DecodeError as error:
             raise FileProblem(f"not a result: {text.line(str(error))}") from None
-        return results if isinstance(results, list) else [results]
+        if results:  # otherwise it was interrupted
+            return results if isinstance(results, list) else [results]
     try:
         head, *rows = tables.read(path / ROWS, MAX_TABLE_BYTES) or [[]]
         return [dict(zip(head, row, strict=False)) for row in rows]

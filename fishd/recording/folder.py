@@ -16,6 +16,10 @@ from fishd.recording.summary import Summary
 from fishd.recording.writer import RunWriter
 
 FOLDER_VARIABLE = "FISHD_RUNS"
+EXPERIMENT = "experiment.json"
+"""File with the header of an experiment, in its folder."""
+MAX_LISTED = 3
+"""Largest number of recordings of an experiment that a message lists."""
 LATEST = "latest"
 """Name that refers to the recording with the largest number, the newest one."""
 
@@ -121,9 +125,12 @@ def find_recording(run: str, folder: Path | None = None) -> Path:
         if not known:
             raise RecordingError(f"{folder} contains no recording; make one with 'fishctl record'")
         return known[-1]
+    base = path if "/" in run else folder / run
     for suffix in ("", SUFFIX, SUFFIX + PART_SUFFIX):
-        if "/" not in run and (candidate := folder / (run + suffix)).is_file():
+        if (candidate := Path(f"{base}{suffix}")).is_file():
             return candidate
+    if (base / EXPERIMENT).is_file():
+        raise RecordingError(f"{base} is an experiment, not a recording; {_list_content(base)}")
     names = [run_name(path) for path in known]
     hint = (
         suggest(run, names[-10:], listed="recordings there")
@@ -131,6 +138,16 @@ def find_recording(run: str, folder: Path | None = None) -> Path:
         else "that folder contains none"
     )
     raise RecordingError(f"no recording '{run}', neither a file nor a name in {folder}; {hint}")
+
+
+def _list_content(experiment: Path) -> str:
+    """Return in words the recordings and pictures in the folder of an experiment."""
+    lists = []
+    for kind, pattern in (("recordings", f"*{SUFFIX}"), ("pictures", "*.png")):
+        names = [str(path) for path in sorted(experiment.rglob(pattern))]
+        more = f" and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else ""
+        lists.append(f"{kind}: {', '.join(names[:MAX_LISTED]) or 'none'}{more}")
+    return "; ".join(lists)
 
 
 def run_name(path: Path) -> str:

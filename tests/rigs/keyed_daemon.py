@@ -11,7 +11,7 @@ from pathlib import Path
 import zmq
 
 from fishd.core import files, keys
-from fishd.daemon.gateway.keys import SETTLE_TIME_S
+from fishd.daemon.gateway.keys import FILE_QUIET_TIME_S
 from rigs.processes import FISHCTL, Daemon, call, reserve_port, running, sets, wait_until
 
 
@@ -54,7 +54,7 @@ class KeyedDaemon:
         """Write the file of fishd, and wait until fishd takes the change for complete."""
         files.write_atomically(self.known, text)
         changed = self.known.stat().st_ctime
-        wait_until(lambda: time.time() - changed > SETTLE_TIME_S)
+        wait_until(lambda: time.time() - changed > FILE_QUIET_TIME_S)
 
     def know(self, name: str, key: str) -> None:
         """Let a client expect this public key of fishd."""

@@ -34,7 +34,7 @@ from fishd.client import Fish, Refused
 from fishd.client.zmq_sockets import connect_subscriber
 from fishd.core import files
 from fishd.core.errors import NoKey
-from fishd.daemon.gateway.keys import EMPTY_SETTLE_TIME_S
+from fishd.daemon.gateway.keys import EMPTY_FILE_QUIET_TIME_S
 
 SILENCE_S = 5.0
 """Time without a message after which a client looks for the reason [s]."""
@@ -265,7 +265,7 @@ def test_an_emptied_file_lets_no_client_in_but_not_while_it_is_written(
             return (mode, driver.stop().mode) == ("idle", "idle")
         except (Refused, NoKey):
             # It was empty for longer than an editor leaves it so.
-            assert time.monotonic() - begun > EMPTY_SETTLE_TIME_S / 2
+            assert time.monotonic() - begun > EMPTY_FILE_QUIET_TIME_S / 2
             keyed.write(before)
             return False
 

@@ -13,7 +13,7 @@ from typing import Literal
 
 from fishd.core.signals import Observation
 
-SETTLE_TIME_S = 1.0
+FIN_DECAY_TIME_S = 1.0
 """Time without a movement of the tail after which the fin is still [s]."""
 MIN_REST_S, MAX_REST_S = 0.5, 1.0
 """Shortest and longest rest after that, from which offset and noise of F_y are estimated [s]."""
@@ -118,7 +118,7 @@ class LateralSign:
 
     def _at_rest(self, seen: Observation, fy: float) -> None:
         self._still += seen.dt
-        if self._still <= SETTLE_TIME_S:
+        if self._still <= FIN_DECAY_TIME_S:
             return
         self._rest.append((fy, seen.dt))
         self._rested += seen.dt

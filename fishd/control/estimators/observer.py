@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from fishd.control.estimators.base import Estimator
-from fishd.control.estimators.lateral_sign import SETTLE_TIME_S
+from fishd.control.estimators.lateral_sign import FIN_DECAY_TIME_S
 from fishd.core.estimation import EstimatorSettings
 from fishd.core.signals import Measurement
 from fishd.virtual.plant.parameters import PlantParameters
@@ -85,8 +85,8 @@ class Observer(Estimator):
         settings, fish, undelayed = self._settings, self._fish, self._undelayed
         rotation = settings.sensor_rotation
         force = math.cos(rotation) * measurement.fy - math.sin(rotation) * measurement.fx
-        if dt > SETTLE_TIME_S:  # fishd was suspended, and the motion of fin and water has decayed
-            dt, self._offset = SETTLE_TIME_S, None
+        if dt > FIN_DECAY_TIME_S:  # fishd was suspended, and fin and water have come to rest
+            dt, self._offset = FIN_DECAY_TIME_S, None
             self._covariance = np.diag(np.square(_INITIAL_SDS))
         window = fish.advance(instruction_angle, dt, 1)
         undelayed.advance(instruction_angle, dt, 1)

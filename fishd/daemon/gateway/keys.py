@@ -15,7 +15,7 @@ from fishd.core.trusted_folder import find_folder_problem
 
 WATCH_OPERATIONS = READ_OPERATIONS | {"estop"}
 """Operations for which the role `watch` is enough."""
-SETTLE_TIME_S, EMPTY_SETTLE_TIME_S = 0.1, 1.0
+FILE_QUIET_TIME_S, EMPTY_FILE_QUIET_TIME_S = 0.1, 1.0
 """Age of a change of the file from which on it is read, and of an empty file, which an editor may
 still write [s]."""
 
@@ -34,7 +34,7 @@ class KnownKeys:
         self._stamp: tuple[int, int, int, str | None] | None = None
         while self._stamp is None:
             self._update()
-            time.sleep(SETTLE_TIME_S / 10)
+            time.sleep(FILE_QUIET_TIME_S / 10)
 
     def find(self, key: str) -> keys.KnownKey | None:
         """Return the client of a public key; None if the key is not known."""
@@ -45,8 +45,8 @@ class KnownKeys:
         """Read the file if it has changed; note what is wrong with it, or which key was removed."""
         now, stamp = time.time(), self._read_stamp()
         changed, size, *_ = stamp
-        settle_time = SETTLE_TIME_S if size else EMPTY_SETTLE_TIME_S
-        if stamp == self._stamp or abs(now - changed * 1e-9) < settle_time:
+        quiet_time = FILE_QUIET_TIME_S if size else EMPTY_FILE_QUIET_TIME_S
+        if stamp == self._stamp or abs(now - changed * 1e-9) < quiet_time:
             return
         try:
             lines, mistakes = keys.read_known(self.path.parent)

@@ -1,7 +1,7 @@
 """Simulated sensors: one with configured values, and stand-ins for those of a robot."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 from msgspec import Meta
@@ -50,21 +50,31 @@ class StandIn(SensorDriver[Any]):
     """Stand-in of a simulated fish for a sensor of the robot: constants within the limits."""
 
     stands_for: ClassVar[type[SensorDriver[Any]]]
+    modelled: ClassVar[Sequence[str]]
+    """Readings, as the configuration names them, that come from a model of the fish instead."""
 
     @classmethod
-    def of(cls, kind: type[SensorDriver[Any]]) -> type["StandIn"]:
-        """Return the stand-in for a kind of sensor."""
-        return type("StandIn", (cls,), {"stands_for": kind})
+    def of(cls, kind: type[SensorDriver[Any]], modelled: Sequence[str]) -> type["StandIn"]:
+        """Return the stand-in for a kind of sensor, without the readings that have a model."""
+        return type("StandIn", (cls,), {"stands_for": kind, "modelled": modelled})
 
     @property
     def limitations(self) -> tuple[str, ...]:  # type: ignore[override]
         """Line that says that it is no true sensor."""
-        return (f"{self.section} is simulated, as the fish is: its readings are constant",)
+        constant = "its readings are constant"
+        if self.modelled:
+            constant = f"its {', '.join(self.modelled)} is that of a model"
+            constant += ", its other readings are constant" if self.sample() else ""
+        return (f"{self.section} is simulated, as the fish is: {constant}",)
 
     def sample(self) -> dict[str, float]:
         """Return the middle of the limits of each reading."""
-        readings = self.stands_for.declare(self.settings)
-        return {name: _middle(reading) for name, reading in readings.items()}
+        readings, names = self.stands_for.declare(self.settings), self.settings.rename
+        return {
+            name: _middle(reading)
+            for name, reading in readings.items()
+            if names.get(name, name) not in self.modelled
+        }
 
 
 def _middle(reading: Reading) -> float:

@@ -59,6 +59,8 @@ class Curve(NamedTuple):
     results: list[PointResult]
     peak: Peak | None
     """Maximum of the curve; None without a quantity, or if no point has a value."""
+    is_complete: bool
+    """Whether all points of the grid are measured."""
 
 
 class WholeTicks(Struct, frozen=True):
@@ -127,23 +129,26 @@ def make_curves(folder: SweepFolder, points: Sequence[Point]) -> list[Curve]:
         for name in {point.controller for point in points}
     }
     for point in points:
-        if folder.key(point) in folder.results:
-            columns = point.columns()
-            quantity = axes[point.controller]
-            quantity = quantity if is_number(columns.get(quantity)) else ""
-            settings = {name: value for name, value in columns.items() if name != quantity}
-            groups.setdefault((quantity, json.dumps(settings)), []).append(point)
-    return [_make_curve(folder, group, quantity, points) for (quantity, _), group in groups.items()]
+        columns = point.columns()
+        quantity = axes[point.controller]
+        quantity = quantity if is_number(columns.get(quantity)) else ""
+        settings = {name: value for name, value in columns.items() if name != quantity}
+        groups.setdefault((quantity, json.dumps(settings)), []).append(point)
+    return [
+        _make_curve(folder, group, quantity, points)
+        for (quantity, _), group in groups.items()
+        if any(folder.key(point) in folder.results for point in group)
+    ]
 
 
 def find_best(curve: Curve) -> Best | None:
-    """Return the best point of a curve; None if no point has a value."""
+    """Return the best point of a curve; None if it is not complete, or no point has a value."""
     measured = [
         (result.value, index)
         for index, result in enumerate(curve.results)
         if result.value is not None
     ]
-    if not measured:
+    if not (measured and curve.is_complete):
         return None
     value, index = max(measured)
     point, maximum = curve.points[index], curve.peak
@@ -207,6 +212,9 @@ def _is_whole(ticks: float) -> bool:
 def _make_curve(
     folder: SweepFolder, group: list[Point], quantity: str, all_points: Sequence[Point]
 ) -> Curve:
+    total = len(group)
+    group = [point for point in group if folder.key(point) in folder.results]
+    is_complete = len(group) == total
     results = [folder.results[folder.key(point)] for point in group]
     x = [float(point.columns()[quantity]) for point in group] if quantity else []
     measured = [
@@ -215,8 +223,11 @@ def _make_curve(
         if result.value is not None
     ]
     maximum = find_peak(*map(list, zip(*measured, strict=True))) if measured else None
+    if maximum and not is_complete:
+        maximum = maximum._replace(coefficients=None)
     label = group[0].label(without={*_find_constant_columns(all_points), quantity})
-    return Curve(label, quantity.removeprefix(PARAMETER_PREFIX), group, x, results, maximum)
+    x_name = quantity.removeprefix(PARAMETER_PREFIX)
+    return Curve(label, x_name, group, x, results, maximum, is_complete)
 
 
 def _find_constant_columns(points: Sequence[Point]) -> set[str]:

@@ -264,6 +264,7 @@ def test_readings_are_in_the_screen_in_status_and_in_the_line_of_watch() -> None
         "depth": ReadingState(
             unit="m", sensor="pump", value=None, age=None, problem="no depth", **about
         ),
+        "ph": ReadingState(unit="1", sensor="ph", value=7.2, age=0.0, problem=None, **about),
     }
     shown = status(readings=readings)
     screen = "\n".join(render(view_of(map(tick, range(1, 101)), readings=readings)))
@@ -272,6 +273,7 @@ def test_readings_are_in_the_screen_in_status_and_in_the_line_of_watch() -> None
     assert _reading_rows(shown) == [
         ("meter", "power 671 mW"),
         ("pump", "flow 1.5 L/min (3 s old), depth –"),
+        ("ph", "7.2"),
     ]
 
 

@@ -15,11 +15,11 @@ from rigs.processes import fishctl, one_line
 from fishd.config import Config, load
 from fishd.core.errors import ConfigError, FishdError, RecordingError
 from fishd.core.signals import Tick
-from fishd.lab.experiment import Header, open_experiment
+from fishd.lab.experiment import Header, find_answer, open_experiment
 from fishd.lab.parallel import FileStop
 from fishd.lab.rerun import rerun
 from fishd.lab.session import Disturbed, VirtualSession
-from fishd.lab.sweep.curves import WholeTicks, find_best_of_whole_ticks, make_curves
+from fishd.lab.sweep.curves import WholeTicks, find_best, find_best_of_whole_ticks, make_curves
 from fishd.lab.sweep.grid import MAX_POINTS, Lengths, Point
 from fishd.lab.sweep.measuring import Task, measure_all, simulate_point, swim
 from fishd.lab.sweep.results import Result, SweepFolder, select_quantity
@@ -208,6 +208,23 @@ def test_a_curve_tells_the_best_frequency_in_ticks_or_that_it_lacks_one(tmp_path
     folder.add_result(best, Result(thrust=0.02574, thrust_ci95=1e-4), b"a recording")
     (curve,) = make_curves(folder, [*points, best])
     assert find_best_of_whole_ticks(folder, curve) == WholeTicks(1.66667, 0.02574, 1e-4, None)
+
+
+def test_an_unfinished_curve_has_no_best_point(tmp_path: Path) -> None:
+    folder = open_folder(tmp_path)
+    points = [Point("square", {"frequency": value}) for value in (1.4, 1.6, 1.8, 2.0, 2.2, 2.5)]
+    thrusts = [0.0227, 0.0251, 0.0252, 0.0238, 0.0216, 0.0176]
+    for count, (point, thrust) in enumerate(zip(points, thrusts, strict=True)):
+        assert not any(map(find_best, make_curves(folder, points))), f"{count} of 6 points"
+        folder.add_result(point, Result(thrust=thrust, thrust_ci95=1e-4), b"a recording")
+    (tmp_path / "result.json").write_text("[]")
+    assert find_answer(tmp_path).thrust == max(thrusts)
+    (curve,) = make_curves(folder, points[:5])
+    (unfinished,) = make_curves(folder, [*points, Point("square", {"frequency": 3.0})])
+    assert find_best(curve)
+    assert curve.peak
+    assert unfinished.peak
+    assert (curve.peak.coefficients is None, unfinished.peak.coefficients) == (False, None)
 
 
 @pytest.mark.parametrize(("word", "shown"), [("auto", "auto"), (None, "default")])

@@ -1,15 +1,15 @@
 """Robots of other packages: one class and one entry point."""
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from rigs.example_packages import forget_drivers
-from rigs.processes import install
+from rigs.processes import fishctl, install
 
 from fishd.config import check_tethered, json_schema, load
 from fishd.core.errors import ConfigError, StartupError
-from fishd.lab.simulation import simulate
 from fishd.lab.simulation.virtual_run import KeepingPublisher, VirtualRun
 
 CODE = """
@@ -92,7 +92,13 @@ def test_a_robot_of_another_package_swims_with_its_settings_and_its_name() -> No
             run.tick()
         assert run.about()["robot"] == "twin"
     assert publisher.ticks[-1].fx == pytest.approx(0.2)
-    assert simulate(config, "square", {"frequency": 2.0}, 12.0).mean_thrust > 0.0
+    done = fishctl("simulate", "square", "--for", "12", "--set", "robot=twin")
+    assert "thrust" in done.stdout
+    assert "relative" not in done.stdout, "its best square wave is not that of section plant"
+    done = fishctl("simulate", "square", "--for", "12", "--set", "robot=twin", "--json")
+    report = json.loads(done.stdout)
+    assert report["mean_thrust"] > 0.0
+    assert not {"relative_thrust", "best_square_thrust", "best_square_frequency"} & set(report)
 
 
 @pytest.mark.slow

@@ -80,6 +80,25 @@ WATER = "sensors.water={kind: ds18b20}"
             "chip needs a different address",
         ),
         (
+            ["sensors.meter={kind: simulated, name: power}"],
+            "sensors.meter: its reading power is the name of a reading of the simulated fish "
+            "already: another name is needed, as in sensors.meter.rename",
+        ),
+        (
+            ["sensors.water={kind: ds18b20, stale_after: 0.5}"],
+            "sensors.water.stale_after: 0.5 is not valid: a time longer than its period of 1 s is "
+            "needed",
+        ),
+        (
+            ["tick=0.05", "sensors.flow={kind: ads1115, required: true, stale_after: 0.05}"],
+            "sensors.flow.stale_after: 0.05 is not valid: a time longer than its period of 0.05 s "
+            "is needed",
+        ),
+        (
+            ["sensors.flow={kind: ads1115, low: 30, high: 20}"],
+            "sensors.flow.low: 30 is not valid: at most 20, its high, is needed",
+        ),
+        (
             ["robot=virtual-pi", WATER],
             "sensors.water.kind: 'ds18b20' is not valid: the virtual Pi has an ADS1115, pigpiod "
             "and an INA219 or INA226; 'ina219', 'ina226' or 'simulated' is needed",
@@ -157,6 +176,27 @@ def test_sensors_of_a_robot_have_stand_ins_on_a_simulated_fish_which_says_so() -
     }
     assert rig.loop.robot.limitations() == (
         "sensors.water is simulated, as the fish is: its readings are constant",
+        "sensors.power_meter is simulated, as the fish is: its power is that of a model",
+    )
+
+
+def test_only_the_reading_that_has_a_model_is_replaced_in_a_sensor_with_others() -> None:
+    imu = "sensors.imu={kind: lsm6dsox, required: true, rename: {rotation_x: power}}"
+    rig = Rig(imu)
+    readings = rig.run(5)[-1].readings
+    assert readings == {"power": pytest.approx(0.06)} | dict.fromkeys(
+        ("acceleration_x", "acceleration_y", "acceleration_z", "rotation_y", "rotation_z"), 0.0
+    )
+    assert rig.config.readings == rig.loop.readings.declared
+    assert rig.loop.robot.limitations() == (
+        "sensors.imu is simulated, as the fish is: its power is that of a model, its other "
+        "readings are constant",
+    )
+
+
+def test_a_simulated_power_meter_is_permitted_where_the_fish_has_no_model_of_its_power() -> None:
+    assert (
+        "power" in load(None, ["robot=pi", "sensors.meter={kind: simulated, name: power}"]).readings
     )
 
 

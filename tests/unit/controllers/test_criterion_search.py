@@ -5,10 +5,10 @@ from itertools import groupby
 
 import pytest
 from msgspec.structs import replace
-from rigs.harness import LIMITS, Rig, observe
+from rigs.harness import LIMITS, PINNED_TICK, Rig, observe
 
 from fishd.cli.output import format_criterion
-from fishd.config import load
+from fishd.config import Config, load
 from fishd.controllers import registry
 from fishd.controllers.criterion_search import LADDER, START_INDEX, CriterionSearch, Phase
 from fishd.core.errors import ParameterError
@@ -16,10 +16,14 @@ from fishd.lab.compare.survey import harsh
 from fishd.lab.simulation import KeepingPublisher, simulate
 
 
+def pinned(*overrides: str) -> Config:
+    return load(None, (PINNED_TICK, *overrides))
+
+
 def relative_thrust(
     C: float | str, *overrides: str, seconds: float = 90.0, settle: float = 60.0
 ) -> float:
-    return simulate(load(None, overrides), "swing", {"C": C}, seconds, settle).relative_thrust
+    return simulate(pinned(*overrides), "swing", {"C": C}, seconds, settle).relative_thrust
 
 
 def fixed(*overrides: str) -> float:
@@ -45,7 +49,7 @@ def test_it_is_near_the_best_with_any_servo_and_much_noise(servo_speed: float) -
 
 @pytest.mark.slow
 def test_where_the_best_half_beat_lies_between_two_numbers_of_ticks_the_sides_take_turns() -> None:
-    config = load(None, harsh(318).overrides)
+    config = pinned(*harsh(318).overrides)
     squares = [simulate(config, "square", {"frequency": 10 / n}, 30.0) for n in (3, 4, 5, 6)]
     whole = [square.relative_thrust for square in squares]
     result = simulate(config, "swing", {"C": "auto"}, 90.0, 60.0)
@@ -57,7 +61,7 @@ def test_where_the_best_half_beat_lies_between_two_numbers_of_ticks_the_sides_ta
 
 @pytest.mark.slow
 def test_a_gait_that_a_trial_has_lost_is_begun_again_and_that_trial_not_repeated() -> None:
-    config = load(None, harsh(652).overrides)
+    config = pinned(*harsh(652).overrides)
     assert simulate(config, "swing", {"C": 0.95, "lead": 0.05}, 30.0).relative_thrust < 0.1
     assert relative_thrust("auto", *harsh(652).overrides) > 0.95
 
@@ -164,7 +168,7 @@ def test_a_watched_gait_that_becomes_much_weaker_or_stronger_restarts_the_search
 def test_a_ripple_below_the_noise_chooses_no_criterion_and_says_so_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    weak = load(None, ("amplitude_limit=0.05", "simulation.noise=2.3e-3", "simulation.seed=3"))
+    weak = pinned("amplitude_limit=0.05", "simulation.noise=2.3e-3", "simulation.seed=3")
     publisher = KeepingPublisher()
     simulate(weak, "swing", {"C": "auto"}, 180.0, publisher=publisher)
     shown = [tick.quantities for tick in publisher.ticks if tick.time > 90.0]
@@ -178,7 +182,7 @@ def test_a_ripple_below_the_noise_chooses_no_criterion_and_says_so_once(
 
 
 def test_a_ripple_that_is_seldom_clear_begins_no_search() -> None:
-    noisy = load(None, ("simulation.noise=0.05", "simulation.seed=2"))
+    noisy = pinned("simulation.noise=0.05", "simulation.seed=2")
     publisher = KeepingPublisher()
     simulate(noisy, "swing", {"C": "auto"}, 400.0, publisher=publisher)
     shown = [tick.quantities for tick in publisher.ticks if tick.time > 150.0]
@@ -186,4 +190,4 @@ def test_a_ripple_that_is_seldom_clear_begins_no_search() -> None:
 
 
 def test_a_ripple_above_the_noise_is_clear() -> None:
-    assert simulate(load(None), "swing", {"C": "auto"}, 60.0).quantities["clear"] == 1.0
+    assert simulate(pinned(), "swing", {"C": "auto"}, 60.0).quantities["clear"] == 1.0

@@ -4,13 +4,17 @@ import json
 import os
 import signal
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import click
 import msgspec
 import pytest
+from click.testing import CliRunner
 from rigs.processes import fishctl, one_line
 
+from fishd.cli.experiment import Run, experiment_options
 from fishd.core.errors import ConfigError, FishdError
 from fishd.core.signals import Tick
 from fishd.lab.experiment import (
@@ -186,6 +190,21 @@ def test_a_measurement_keeps_header_recording_and_result_and_is_listed(tmp_path:
     done = fishctl("runs", "--folder", str(tmp_path))
     assert done.returncode == 1
     assert f"fishctl: {folder}/experiment.json: fishd" in done.stderr
+
+
+def test_a_verb_without_a_picture_is_an_experiment_without_plot() -> None:
+    @click.group()
+    def group() -> None: ...
+
+    @group.command()
+    @experiment_options()
+    def verb(run: Run) -> None:
+        run.open({})
+
+    call = partial(CliRunner().invoke, group, catch_exceptions=False)
+    done = call(["verb", "--on", "simulation"])
+    assert done.output == "fish: the default simulated fish\n"
+    assert "No such option '--plot'" in call(["verb", "--plot", "x.png"]).output
 
 
 class Value(msgspec.Struct):

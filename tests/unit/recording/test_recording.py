@@ -333,12 +333,30 @@ def test_what_is_no_regular_file_is_no_recording_of_a_folder(tmp_path: Path) -> 
 
 def test_a_name_means_a_recording_of_the_folder(tmp_path: Path) -> None:
     path = record_run(swum(0.2), tmp_path / "morning")
-    for name in ("morning", str(path), "latest"):
+    for name in ("morning", str(path), str(tmp_path / "morning"), "latest"):
         assert find_recording(name, tmp_path) == path
     with pytest.raises(RecordingError, match="did you mean 'morning'"):
         find_recording("mornin", tmp_path)
     with pytest.raises(RecordingError, match="contains no recording"):
         find_recording("latest", tmp_path / "nowhere")
+
+
+def test_the_name_of_an_experiment_shows_its_recordings_and_pictures(tmp_path: Path) -> None:
+    folder = tmp_path / "sweep"
+    (folder / "points").mkdir(parents=True)
+    for name in ("experiment.json", *(f"points/{number}.mcap" for number in range(1, 6))):
+        (folder / name).touch()
+    recordings = ", ".join(f"{folder}/points/{number}.mcap" for number in (1, 2, 3))
+    for name in ("sweep", str(folder)):
+        with pytest.raises(RecordingError) as caught:
+            find_recording(name, tmp_path)
+        assert str(caught.value) == (
+            f"{folder} is an experiment, not a recording; recordings: {recordings} and 2 more; "
+            "pictures: none"
+        )
+    (folder / "thrust.png").touch()
+    with pytest.raises(RecordingError, match=f"pictures: {folder}/thrust.png$"):
+        find_recording("sweep", tmp_path)
 
 
 def test_ticks_that_only_a_status_reveals_count_as_lost(tmp_path: Path) -> None:
