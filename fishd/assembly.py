@@ -98,7 +98,13 @@ def open_swimmer(config: Config) -> "Swimmer":
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         raise MissingPackage.of_extra("robot: swimmer", package, "swimmer") from None
-    return Swimmer(config.swimmer, config.plant, config.amplitude_limit, config.tick)
+    return Swimmer(
+        config.swimmer,
+        config.plant,
+        config.amplitude_limit,
+        config.tick,
+        senses_tail=config.estimator.kind == "tail",
+    )
 
 
 def parts_of(config: Config) -> tuple[ownership.Part, ...]:
@@ -410,7 +416,7 @@ def build_estimator(config: Config) -> Estimator:
     """Return the estimator that `estimator.kind` names."""
     if config.estimator.kind == "observer":
         return Observer(config.estimator, config.plant, config.tick)
-    if config.estimator.kind == "sensor":
+    if config.estimator.kind in ("sensor", "tail"):
         return FinSensor()
     return LateralForceEstimator(config.estimator)
 

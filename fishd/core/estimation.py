@@ -20,7 +20,7 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """Settings of the estimator of fin velocity and thrust."""
 
     kind: Annotated[
-        Literal["lateral_force", "observer", "sensor"],
+        Literal["lateral_force", "observer", "sensor", "tail"],
         note(
             "lateral_force integrates F_y and knows nothing of the fish; observer is a Kalman "
             "filter on the fish of section plant, as fishctl identify finds it; sensor takes the "
