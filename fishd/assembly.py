@@ -451,13 +451,13 @@ def build_loop(
         robot=robot,
         estimator=build_estimator(config),
         thrust=build_live_thrust(config),
+        lateral_sign=LateralSign(config.estimator.reversed_fy),
         guard=guard,
         settings=config,
         limits=config.limits,
         clock=clock,
         publisher=publisher,
         notify=notify,
-        lateral_sign=LateralSign(config.estimator.reversed_fy),
     )
     start = config.start
     if created := start.create_controller(config.limits):

@@ -34,27 +34,37 @@ def references() -> Iterator[tuple[str, str, str]]:
     """Yield documents, names of markers, and the tables between them."""
     structs: dict[str, Struct] = {"keys": Config(), "camera keys": CameraSettings()}
     for marker, struct in structs.items():
-        yield PAGE, marker, "\n\n".join(_sections(struct, ""))
+        yield PAGE, marker, "\n\n".join(_sections(struct))
 
 
-def _sections(section: Struct, prefix: str) -> Iterator[str]:
-    """Yield a heading and a table for a section, then for each section inside it."""
-    plain, nested = [], []
+def _sections(config: Struct) -> Iterator[str]:
+    """Yield a table of the keys outside sections, then a heading and a table for each section."""
+    nested = []
+    plain = []
+    for field in fields_of(type(config)):
+        value = getattr(config, field.name)
+        chosen = isinstance(config, Config) and field.name in CHOICES
+        if chosen or isinstance(value, Struct):
+            nested.append((field, value, chosen))
+        else:
+            plain.append(_row(field, value, ""))
+    yield table(HEAD, plain)
+    for field, value, chosen in nested:
+        yield f"### `{field.name}`\n\n{field.description}"
+        if chosen:
+            yield from _choice_section(field.name)
+        else:
+            yield table(HEAD, _rows(value, f"{field.name}."))
+
+
+def _rows(section: Struct, prefix: str) -> Iterator[list[str]]:
+    """Yield a row for each key of a section and of the sections inside it."""
     for field in fields_of(type(section)):
         value = getattr(section, field.name)
-        if isinstance(value, Struct) or (isinstance(section, Config) and field.name in CHOICES):
-            nested.append((field, value))
+        if isinstance(value, Struct):
+            yield from _rows(value, f"{prefix}{field.name}.")
         else:
-            plain.append(_row(field, value, prefix))
-    if plain:
-        yield table(HEAD, plain)
-    for field, value in nested:
-        name = prefix + field.name
-        yield f"### `{name}`\n\n{field.description}"
-        if field.name in CHOICES and isinstance(section, Config):
-            yield from _choice_section(name)
-        else:
-            yield from _sections(value, name + ".")
+            yield _row(field, value, prefix)
 
 
 def _choice_section(section: str) -> Iterator[str]:

@@ -61,7 +61,7 @@ def references() -> Iterator[tuple[str, str, str]]:
     for name, struct in STRUCTS.items():
         yield "reference/protocol.md", name, _fields(struct, *LIKE.get(name, ("", Struct)))
     conditions = [[f"`{name}`", meaning] for name, meaning in messages.CONDITIONS.items()]
-    yield "how-to/camera.md", "conditions", table("state | what it means", conditions)
+    yield "reference/protocol.md", "conditions", table("state | what it means", conditions)
     kinds = [[f"`{kind}`", *cells] for kind, *cells in signals.EVENTS]
     yield "reference/protocol.md", "kinds", table("kind | level | when | `data`", kinds)
     operations = [

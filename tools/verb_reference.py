@@ -51,13 +51,15 @@ def options(command: click.Command) -> set[str]:
 
 
 def reference() -> str:
-    """Return the table: a row for each verb with a shared option, and these options."""
-    rows = []
+    """Return the table: a row for each set of shared options, and the verbs that have it."""
+    verbs: dict[str, list[str]] = {}
     for verb, command in commands(fishctl):
-        shared = [f"`{option}`" for option in SHARED if option in options(command)]
+        shared = " ".join(f"`{option}`" for option in SHARED if option in options(command))
         if shared:
-            rows.append([f"`{verb}`", " ".join(shared)])
-    return table("verb | shared options", rows)
+            verbs.setdefault(shared, []).append(f"`{verb}`")
+    return table(
+        "verbs | shared options", ([", ".join(names), own] for own, names in verbs.items())
+    )
 
 
 if __name__ == "__main__":

@@ -74,7 +74,7 @@ class ActiveController:
         )
 
     def update(self, observation: Observation) -> Any:
-        """Return the command of the controller, unchecked.
+        """Return the instruction angle of the controller, unchecked.
 
         Raises what the controller raises, so call this through `call_foreign`.
         """

@@ -7,7 +7,7 @@ from fishd.core.foreign_code import call_foreign, real_number
 
 
 class Guard:
-    """A limiter of the instruction angle without a memory of commands, so nothing can wind up."""
+    """A limiter of the instruction angle without a memory of its own, so nothing can wind up."""
 
     def __init__(
         self, amplitude: float, tick: float, slew_limit: float | None, fade_time: float
@@ -34,17 +34,17 @@ class Guard:
         self.highest = min(self._amplitude, highest)
         """Highest permitted angle [rad]."""
 
-    def apply(self, command: Any, previous: float) -> float:
+    def apply(self, chosen: Any, previous: float) -> float:
         """Return the instruction angle to send [rad].
 
-        command: angle that the controller commands [rad]: a real number of any type, numpy's too
-        previous: angle that is applied now [rad]
-        Raises ValueError when the command is not a number, or not finite.
+        chosen: the controller's [rad]: a real number of any type, numpy's too
+        previous: the one that was sent in the previous tick [rad]
+        Raises ValueError when `chosen` is not a number, or not finite.
         """
-        is_float = type(command) is float
-        angle = command if is_float else call_foreign(real_number, command, "the command")
+        is_float = type(chosen) is float
+        angle = chosen if is_float else call_foreign(real_number, chosen, "the instruction angle")
         if not math.isfinite(angle):
-            raise ValueError(f"the command is {angle}, not an angle")
+            raise ValueError(f"the instruction angle is {angle}, not a finite number")
         if angle > self.highest:
             angle = self.highest
         elif angle < self.lowest:

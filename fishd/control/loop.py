@@ -9,8 +9,8 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from msgspec import UNSET, Struct
-from msgspec.structs import replace
+from msgspec import Struct
+from msgspec.structs import asdict
 
 from fishd.control.active_controller import ActiveController, Successor, fault_and_successor
 from fishd.control.estimators.base import Estimator
@@ -18,6 +18,7 @@ from fishd.control.estimators.lateral_sign import LateralSign
 from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.guard import Guard
 from fishd.control.lease import Lease
+from fishd.control.perception import Perception
 from fishd.control.reporting import Reporter
 from fishd.control.servo import ServoOutput, ServoPower
 from fishd.control.statistics import Statistics
@@ -26,7 +27,7 @@ from fishd.controllers.base import Controller, Limits
 from fishd.core import text
 from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import Clock, Slot
-from fishd.core.errors import ControllerFault, FishLost, Refused, SensorError
+from fishd.core.errors import ControllerFault
 from fishd.core.foreign_code import call_foreign
 from fishd.core.loop_settings import LoopSettings
 from fishd.core.signals import Measurement, Observation, Publisher, Tick
@@ -39,12 +40,10 @@ UPDATE_BUDGET = 0.5
 """Largest fraction of the period that an update of the controller may take."""
 SETTLE_TIME_S = 0.1
 """Time that a servo stays at neutral before its pulses end [s]."""
-MAX_SAMPLE_AGE_PERIODS = 2.0
-"""Largest age of the newest sample, in periods; a read with an older one counts as failed."""
 
 
-class Turn(Struct, frozen=True, gc=False):
-    """The result of the first half of a tick."""
+class TickInputs(Struct, frozen=True, gc=False):
+    """The result of the first half of a tick: what was read, and what follows from it."""
 
     slot: Slot
     measurement: Measurement
@@ -63,13 +62,13 @@ class ControlLoop:
         robot: Robot,
         estimator: Estimator,
         thrust: LiveThrust,
+        lateral_sign: LateralSign,
         guard: Guard,
         settings: LoopSettings,
         limits: Limits,
         clock: Clock,
         publisher: Publisher | None,
         notify: Callable[[float], None] | None = None,
-        lateral_sign: LateralSign | None = None,
     ) -> None:
         """
         publisher: receives the record of every tick, and every event; None: ticks are not recorded
@@ -88,38 +87,28 @@ class ControlLoop:
         self.power = ServoPower(robot, self.reporter, settings.tick)
         self.seq = 0
         """Sequence number of the latest tick."""
-        self.applied = 0.0
+        self.instruction_angle = 0.0
         """Instruction angle that was sent last, after the guard [rad]."""
         self.neutral_for = 0.0
         """Time since the instruction angle became zero [s]."""
-        self.thrust = thrust
-        self.lateral_sign = lateral_sign or LateralSign()
-        self.fy_corrected = False
-        """Whether the latest observation has F_y with the opposite sign of the measured F_y."""
-        self.observation: Observation | None = None
-        """Observation of the latest tick; None before the first one."""
-        self._estimator = estimator
-        self.found_leak = estimator.found_leak
-        """Leak time of the estimator at the latest tick [s]; None unless the estimator finds it."""
+        self.perception = Perception(
+            estimator,
+            thrust,
+            lateral_sign,
+            robot.sensor,
+            self.active,
+            self.supervisor,
+            self.reporter,
+            limits,
+            clock.monotonic(),
+        )
         self._now, self._wall = clock.monotonic, clock.wall
         self._publisher = publisher
         self._mode = self.supervisor.mode.value
         self._notify = notify
         self._budget = UPDATE_BUDGET * settings.tick
-        self._trusted = Measurement(clock.monotonic(), 0.0, 0.0, 0)
-        """Latest measurement that was not suspect."""
         self._index = -1
         self._pending: tuple[int, str, Controller[Any], ServoCalibration | None] | None = None
-
-    @property
-    def known_thrust(self) -> tuple[float, float | None]:
-        """Thrust and the half-width of its 95 % confidence interval [N].
-
-        While the zero of the force is not known, it is the measured thrust, without a half-width.
-        """
-        if self.thrust.thrust is not None:
-            return self.thrust.thrust, self.thrust.ci95
-        return (self.observation.thrust if self.observation else 0.0), None
 
     @property
     def has_settled(self) -> bool:
@@ -130,10 +119,10 @@ class ControlLoop:
         """Run one tick of the loop."""
         self.act(self.observe(slot))
 
-    def observe(self, slot: Slot) -> Turn:
+    def observe(self, slot: Slot) -> TickInputs:
         """Run the first half of a tick: read and estimate. `act` must follow, with the result.
 
-        Between the two, `observation` is the one that the controller will receive.
+        Between the two, `perception.observation` is the one that the controller will receive.
         """
         started = self._now()
         self.seq += 1
@@ -146,32 +135,27 @@ class ControlLoop:
             self._attend_panel(self.robot.panel, slot)
         if self.lease.active:
             self.expire_lease()
-        measurement = self._read(slot)
+        measurement = self.perception.read(slot)
         power = self.power.read(slot.deadline) if self.power.metered else None
         read = self._now()
-        suspect = bool(measurement.suspect)
-        observation = self._estimate(
-            self._last_trusted_measurement() if suspect else measurement, slot, dt
-        )
-        if not (self.supervisor.failures and self.supervisor.sensor_lost):
-            observation = self._follow_thrust(observation, suspect)
-            if self.limits.tethered:
-                self._watch_sign(observation, measurement.fy, suspect)
-        self.observation = observation
-        return Turn(slot, measurement, observation, (started, read, self._now()), power)
+        observation = self.perception.observe(measurement, slot, dt, self.instruction_angle)
+        return TickInputs(slot, measurement, observation, (started, read, self._now()), power)
 
-    def act(self, turn: Turn) -> None:
+    def act(self, inputs: TickInputs) -> None:
         """Run the second half of a tick: let the controller choose, drive the servo, publish."""
-        slot, observation = turn.slot, turn.observation
-        started, read, estimated = turn.marks
-        before, self.applied = self.applied, self._update(observation, estimated)
-        moved = before or self.applied
+        slot, observation = inputs.slot, inputs.observation
+        started, read, estimated = inputs.marks
+        before, self.instruction_angle = (
+            self.instruction_angle,
+            self._update(observation, estimated),
+        )
+        moved = before or self.instruction_angle
         self.neutral_for = 0.0 if moved else self.neutral_for + observation.dt
         updated = self._now()
         self._write(neutral=not moved and self.has_settled)
         written = self._now()
         if self._publisher is not None:
-            self._publish(self._publisher, turn, written)
+            self._publish(self._publisher, inputs, written)
         marks = (started, read, estimated, updated, written, self._now())
         late = self.statistics.add(self.seq, slot.now - slot.deadline, slot.missed, marks)
         if late:
@@ -194,8 +178,7 @@ class ControlLoop:
         Raises `Refused` while a fault or an emergency stop is latched.
         """
         self.supervisor.check_startable()
-        if self._is_refused(controller):
-            raise Refused("fy-reversed", self.lateral_sign.complaint)
+        self.perception.check_usable(controller)
         self._cancel_pending()
         self.active.replace(name, controller)
         active = self.active
@@ -210,19 +193,6 @@ class ControlLoop:
         """
         rest = math.ceil(seconds / self.settings.tick - 1e-9)
         self._pending = (rest, name, controller, self._servo_calibration)
-
-    def forget_force(self, *, scale: bool) -> None:
-        """Discard what depends on the zero of the force sensor, which was changed.
-
-        scale: whether the rest of its calibration was changed, too
-        """
-        self._estimator.forget_zero()
-        if scale:
-            self.thrust.forget()
-            self.lateral_sign.forget()
-        else:
-            self.thrust.forget_zero()
-            self.lateral_sign.rest()
 
     @property
     def pending(self) -> str:
@@ -293,7 +263,7 @@ class ControlLoop:
             self.lease.end(f"{mode}: {reason.message}")
         if mode is not Mode.RUNNING:
             self.active.activate_hold()
-            self._estimator.rest()
+            self.perception.rest()
         self._mode = mode.value
         self.reporter.mode(before, mode, self.supervisor.reason)
 
@@ -309,110 +279,22 @@ class ControlLoop:
         except Exception as error:
             self._fail("estop-button", "the E-stop button cannot be read", error)
 
-    def _read(self, slot: Slot) -> Measurement:
-        problem = None
-        try:
-            measurement = self.robot.sensor.read(slot.deadline)
-            if not math.isfinite(measurement.fx + measurement.fy):
-                raise SensorError(f"it gave ({measurement.fx}, {measurement.fy}) N")
-        except Exception as error:
-            if isinstance(error, FishLost):
-                self._fail("fish-lost", "the fish cannot be read any more", error)
-            problem = f"the force sensor cannot be read: {text.describe_error(error)}"
-            measurement = self._last_trusted_measurement()
-        else:
-            if measurement.suspect or self.supervisor.failures:
-                self.supervisor.check("sensor-range", measurement.suspect)
-            if not measurement.samples:  # it repeats forces that may have been suspect
-                measurement = replace(measurement, fx=self._trusted.fx, fy=self._trusted.fy)
-        if not measurement.suspect:
-            self._trusted = measurement
-        age = slot.now - measurement.time
-        if problem is None and age > MAX_SAMPLE_AGE_PERIODS * self.settings.tick:
-            problem = f"the newest force sample is {age * 1e3:.0f} ms old"
-        if problem or self.supervisor.failures:
-            self.supervisor.check("sensor-stale", problem)
-        return measurement
-
-    def _last_trusted_measurement(self) -> Measurement:
-        """Return the last trusted measurement, marked as holding no new samples."""
-        return replace(self._trusted, samples=0, extremes=None)
-
-    def _estimate(self, measurement: Measurement, slot: Slot, dt: float) -> Observation:
-        try:
-            if self.fy_corrected is not self.lateral_sign.corrected:
-                self._estimator.reverse_fy()
-                self.fy_corrected = self._estimator.fy_corrected
-            known = self.thrust.factor
-            seen = self._estimator.update(measurement, self.applied, slot.deadline, dt, known)
-            if not math.isfinite(seen.fy_rate + seen.fin_velocity + seen.thrust):
-                raise ArithmeticError(f"it gave a fin velocity of {seen.fin_velocity}")
-            return seen
-        except Exception as error:
-            self._fail("estimate-error", "the estimator failed", error)
-            fx, fy, angle = measurement.fx, measurement.fy, self.applied
-            return Observation(slot.deadline, dt, fx, fy, 0.0, 0.0, angle, angle, 0.0, 0.0)
-
-    def _follow_thrust(self, observation: Observation, suspect: bool) -> Observation:
-        """Return the observation with the factor of the thrust, which is reset if its update fails.
-
-        suspect: whether the force of this tick is suspect
-        """
-        try:
-            if self._estimator.found_leak != self.found_leak:
-                self.found_leak = self._estimator.found_leak
-                self.thrust.forget_factor()
-            running = self.supervisor.mode is Mode.RUNNING
-            self.thrust.update(observation, running, self.active.wave)
-            if suspect:
-                self.thrust.interrupt()
-            known = self.thrust.factor
-        except ArithmeticError as error:
-            self.reporter.problem("the estimate of the thrust failed and was reset", error)
-            self.thrust.forget()
-            known = None
-        factor, ci95 = known or (None, None)
-        if factor == observation.thrust_factor and ci95 == observation.thrust_factor_ci95:
-            return observation
-        return replace(observation, thrust_factor=factor, thrust_factor_ci95=ci95)
-
-    def _watch_sign(self, observation: Observation, fy: float, suspect: bool) -> None:
-        """Check the sign of F_y when the tail starts to move, and report a reversed one.
-
-        fy: F_y as measured [N]
-        """
-        if suspect:
-            self.lateral_sign.rest()
-            return
-        try:
-            if self.lateral_sign.update(observation, fy) and self.lateral_sign.reversed:
-                self.reporter.event("calibration", self.lateral_sign.complaint, "warning")
-                if self._is_refused(self.active.controller):
-                    self.supervisor.fail("fy-reversed", self.lateral_sign.complaint)
-        except ArithmeticError as error:
-            self.reporter.problem("the check of the sign of F_y failed and was reset", error)
-            self.lateral_sign.forget()
-
-    def _is_refused(self, controller: Controller[Any]) -> bool:
-        # `is not False`: a value of any type in third-party code raises nothing here.
-        return self.lateral_sign.refuses and type(controller).uses_lateral_force is not False
-
     def _update(
         self, observation: Observation, began: float, *, may_hand_over: bool = True
     ) -> float:
-        """Return the angle to apply: that of the controller, guarded, or a step to neutral [rad].
+        """Return the instruction angle to send [rad]: the controller's, or a step to neutral.
 
         began: start of the time that the controller may take [s, monotonic]
         may_hand_over: whether a controller that gives up may name a successor: once in a tick
         """
         if self.supervisor.mode is Mode.ESTOP:
-            return self.applied
+            return self.instruction_angle
         if self.supervisor.mode is not Mode.RUNNING:
-            return self.guard.fade(self.applied)
+            return self.guard.fade(self.instruction_angle)
         name = self.active.name
         try:
-            command = call_foreign(self.active.update, observation)
-            applied = self.guard.apply(command, self.applied)
+            chosen = call_foreign(self.active.update, observation)
+            permitted = self.guard.apply(chosen, self.instruction_angle)
         except ControllerFault as error:
             code, successor = fault_and_successor(error)
             if successor and may_hand_over:
@@ -425,7 +307,7 @@ class ControlLoop:
             seconds = self._now() - began
             if seconds > self._budget or self.supervisor.failures:
                 self._check_budget(name, seconds)
-            return applied
+            return permitted
         return self._update(observation, self._now(), may_hand_over=False)
 
     def _hand_over(self, error: ControllerFault, code: str, successor: Successor) -> None:
@@ -445,14 +327,14 @@ class ControlLoop:
         self.supervisor.check("controller-slow", problem)
 
     def _write(self, neutral: bool) -> None:
-        """Send the applied angle, or release the servo, as the mode demands."""
+        """Send the instruction angle, or release the servo, as the mode demands."""
         if self.servo.counts_down and (problem := self.servo.why_at_rest()):
-            self.applied = 0.0  # the servo is there; another start would make it jump
+            self.instruction_angle = 0.0  # the servo is there; another start would make it jump
             neutral = True
             self.supervisor.fail("overrun", problem)
         latched, lost = self.supervisor.reason, self.servo.lost
         try:
-            self.servo.command(self.supervisor.mode, self.applied, neutral)
+            self.servo.drive(self.supervisor.mode, self.instruction_angle, neutral)
             if lost:
                 self.reporter.event("servo", "the servo can be reached again")
         except Exception as error:
@@ -466,64 +348,38 @@ class ControlLoop:
                 )
                 self.reporter.event("servo", message, "error")
 
-    def _publish(self, publisher: Publisher, turn: Turn, now: float) -> None:
+    def _publish(self, publisher: Publisher, inputs: TickInputs, now: float) -> None:
         try:
-            publisher.tick(self._record(turn, now))
+            publisher.tick(self._record(inputs, now))
         except Exception as error:
             self._fail("publish-error", "telemetry cannot be published", error)
 
-    def _record(self, turn: Turn, now: float) -> Tick:
-        """Return the record of a tick; all its fields are filled here.
+    def _record(self, inputs: TickInputs, now: float) -> Tick:
+        """Return the record of a tick: the fields of the loop, and those of its parts.
 
         now: time after the servo was driven [s, monotonic]
         """
-        slot, measurement, observation = turn.slot, turn.measurement, turn.observation
-        thrust, thrust_ci95 = self.known_thrust
-        extremes = measurement.extremes
-        swims = self.supervisor.mode is Mode.RUNNING
-        factor = observation.thrust_factor if swims else None
-        factor_ci95 = observation.thrust_factor_ci95 if swims else None
-        truth = self.robot.truth() if self.robot.truth else None
-        course = truth.course if truth else None
-        corrected, mean_time = self.fy_corrected, measurement.mean_time
+        slot, measurement = inputs.slot, inputs.measurement
+        parts = self.perception.telemetry(measurement, inputs.observation)
+        if inputs.power is not None:
+            parts["power"] = inputs.power
+        if quantities := self.active.quantities:
+            parts["quantities"] = quantities
+        if self.robot.truth:
+            truth = self.robot.truth()
+            parts |= {"alpha": truth.alpha, "alpha_rate": truth.alpha_rate, "phi": truth.phi}
+            if truth.course:
+                parts |= asdict(truth.course)
         return Tick(
             t=self._wall(),
             seq=self.seq,
             mode=self._mode,
             controller=self.active.name,
-            fx=measurement.fx,
-            fy=measurement.fy,
-            fy_rate=-observation.fy_rate if corrected else observation.fy_rate,
-            fin_velocity=observation.fin_velocity,
-            phi_c=self.applied,
+            phi_c=self.instruction_angle,
             servo_on=self.servo.on,
-            thrust=thrust,
-            thrust_ci95=UNSET if thrust_ci95 is None else thrust_ci95,
-            frequency=observation.frequency,
-            samples=measurement.samples,
-            fx_min=extremes.fx_min if extremes else UNSET,
-            fx_max=extremes.fx_max if extremes else UNSET,
-            fy_min=extremes.fy_min if extremes else UNSET,
-            fy_max=extremes.fy_max if extremes else UNSET,
             sample_age_ms=(slot.now - measurement.time) * 1e3,
             lateness_us=(slot.now - slot.deadline) * 1e6,
-            busy_time_us=(now - turn.marks[0]) * 1e6,
+            busy_time_us=(now - inputs.marks[0]) * 1e6,
             missed_slots=self.statistics.missed,
-            alpha=truth.alpha if truth else UNSET,
-            alpha_rate=truth.alpha_rate if truth else UNSET,
-            phi=truth.phi if truth else UNSET,
-            quantities=self.active.quantities or UNSET,
-            time=observation.time,
-            x=course.x if course else UNSET,
-            y=course.y if course else UNSET,
-            speed=course.speed if course else UNSET,
-            heading=course.heading if course else UNSET,
-            thrust_factor=UNSET if factor is None else factor,
-            thrust_factor_ci95=UNSET if factor_ci95 is None else factor_ci95,
-            power=UNSET if turn.power is None else turn.power,
-            leak=UNSET if self.found_leak is None else self.found_leak,
-            fy_corrected=True if corrected else UNSET,
-            suspect=text.line(measurement.suspect) if measurement.suspect else UNSET,
-            force_age_ms=UNSET if mean_time is None else (slot.deadline - mean_time) * 1e3,
-            force_span_ms=UNSET if mean_time is None else measurement.span * 1e3,
+            **parts,
         )

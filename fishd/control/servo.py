@@ -1,4 +1,4 @@
-"""The servo as the loop drives it: its command in each mode, its pulses, and its power."""
+"""The servo as the loop drives it: what it gets in each mode, its pulses, and its power."""
 
 import math
 from collections import deque
@@ -51,11 +51,12 @@ class ServoOutput:
             "suspended"
         )
 
-    def command(self, mode: Mode, angle: float, neutral: bool) -> None:
-        """Send an angle [rad], or release the servo: at once in estop, once `neutral` in fault.
+    def drive(self, mode: Mode, instruction_angle: float, neutral: bool) -> None:
+        """Send an instruction angle [rad], or release the servo.
 
-        In fault, pulses never begin: a servo that was lost is released when it can be reached
-        again. Raises what the driver raises; then `lost` is True.
+        It is released at once in estop, and once `neutral` in fault. In fault, pulses never begin:
+        a servo that was lost is released when it can be reached again. Raises what the driver
+        raises; then `lost` is True.
         """
         fading = self.on and not self.lost and not neutral
         try:
@@ -65,7 +66,7 @@ class ServoOutput:
             else:
                 if self.counts_down:
                     self._written = self._now()
-                self._servo.write(angle)
+                self._servo.write(instruction_angle)
                 self.on = True
         except Exception:
             self.lost = True

@@ -114,7 +114,7 @@ class Truth(Struct, frozen=True, gc=False):
 class Tick(Struct, frozen=True, gc=False):
     """Telemetry of one tick; published on topic `tick`.
 
-    `ControlLoop._record` fills each field.
+    `ControlLoop._record` fills each field, with `Perception.telemetry`.
     """
 
     t: Annotated[float, unit("s", "Time of the tick, unix.")]

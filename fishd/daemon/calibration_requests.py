@@ -204,7 +204,7 @@ class CalibrationRequests:
             self._announce("force sensor", path)
         # Apply it in any case, since the next start will use the newest file.
         sensor.recalibrate(calibration)
-        self._loop.forget_force(scale=_matrix(before) != _matrix(calibration))
+        self._loop.perception.forget_force(scale=_matrix(before) != _matrix(calibration))
         return self._current_calibrations()
 
     async def _calibrate_servo(self, request: CalibrateServo) -> Calibrations:

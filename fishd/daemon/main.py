@@ -240,7 +240,7 @@ class Daemon:
 
     def _move_to_neutral(self) -> None:
         """Send neutral and wait until the servo is there, if fishd failed and could not fade."""
-        if self._loop.servo.on and self._loop.applied != 0.0:
+        if self._loop.servo.on and self._loop.instruction_angle != 0.0:
             with suppress(Exception):  # closing the servo comes later, and reports errors
                 servo = self._loop.robot.servo
                 servo.write(0.0)

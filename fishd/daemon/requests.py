@@ -114,8 +114,8 @@ class Operations:
     def status(self) -> Status:
         """Return a snapshot of the daemon's state."""
         loop, access = self._loop, self._access()
-        observation = loop.observation
-        thrust, error = loop.known_thrust
+        observation = loop.perception.observation
+        thrust, error = loop.perception.known_thrust
         return Status(
             t=self._clock.wall(),
             version=__version__,
@@ -147,7 +147,7 @@ class Operations:
             sensor_lost=loop.supervisor.sensor_lost,
             calibrating=self._calibrations.calibrating,
             name=self._name,
-            phi_c=loop.applied,
+            phi_c=loop.instruction_angle,
             force_unit=loop.robot.force_unit,
             quantities=loop.active.quantities,
             quantity_units=loop.active.quantity_units,
@@ -155,8 +155,8 @@ class Operations:
             boot_id=self._boot,
             speed=self._speed(),
             power=loop.power.mean,
-            fy_reversed=loop.lateral_sign.reversed,
-            leak=loop.found_leak,
+            fy_reversed=loop.perception.lateral_sign.reversed,
+            leak=loop.perception.found_leak,
             lease=loop.lease.holder,
             lease_expiry=loop.lease.expired,
             keyed_telemetry=access.keyed_telemetry,
@@ -167,7 +167,7 @@ class Operations:
         loop = self._loop
         return (
             *loop.robot.limitations(),
-            *filter(None, [loop.power.trouble, loop.lateral_sign.complaint]),
+            *filter(None, [loop.power.trouble, loop.perception.lateral_sign.complaint]),
         )
 
     def _speed(self) -> float | None:
@@ -317,7 +317,7 @@ class Operations:
         return self._state()
 
     async def _calibrate_thrust(self, request: protocol.CalibrateThrust) -> State:
-        self._loop.thrust.calibrate(request.factor, request.factor_ci95)
+        self._loop.perception.thrust.calibrate(request.factor, request.factor_ci95)
         return self._state()
 
     def _dispose(self, controller: Controller[Any]) -> None:

@@ -109,7 +109,7 @@ class TrialCalibration:
         except Problem as problem:
             raise Refused("bad-arguments", f"{problem.path[-1]}: {problem}") from None
         lowest, highest = pulses.reach(servo)
-        present, angle = parts.servo.calibration, self._loop.applied
+        present, angle = parts.servo.calibration, self._loop.instruction_angle
         same = (calibration.direction, calibration.scale) == (present.direction, present.scale)
         if not (lowest <= angle <= highest and (same or angle == 0.0)):
             raise Refused(
@@ -160,13 +160,13 @@ class TrialCalibration:
         It cannot at angle 0, nor without pulses at an angle within the limits.
         """
         lowest, highest = pulses.reach(self._settings.calibrated(before))
-        angle = self._loop.applied
+        angle = self._loop.instruction_angle
         return angle == 0.0 or (not self._loop.servo.on and lowest <= angle <= highest)
 
     def _apply(self, calibration: ServoCalibration) -> None:
         parts = calibrated_parts(self._loop)
         if parts.servo.calibration.direction != calibration.direction:
-            self._loop.lateral_sign.forget()
+            self._loop.perception.lateral_sign.forget()
         parts.servo.recalibrate(calibration)
         parts.recalibrated(calibration)
         self._loop.guard.restrict(*parts.servo.reach)

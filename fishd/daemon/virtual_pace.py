@@ -130,11 +130,11 @@ class Lockstep:
         An invalid answer of the agent ends the wait, with a fault.
         poll: function called repeatedly during the wait; may select another controller
         """
-        turn = self._loop.observe(slot)
-        while (agent := self._agent()) and not agent.ready(turn.observation):
+        inputs = self._loop.observe(slot)
+        while (agent := self._agent()) and not agent.ready(inputs.observation):
             await self._wait_for(agent)
             poll()
-        self._loop.act(turn)
+        self._loop.act(inputs)
 
     def _agent(self) -> Remote | None:
         """Return the active controller if it waits for an agent, else None."""

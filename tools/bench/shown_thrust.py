@@ -201,7 +201,7 @@ def shown_thrusts(case: Swim) -> Iterator[tuple[tuple[float, float] | None, floa
             sensor: Any = DriftingSensor(loop.robot.sensor, drift)
             loop.robot = dataclasses.replace(loop.robot, sensor=sensor)
         if case.is_measured:
-            _calibrate(loop.thrust, config, case.wave)
+            _calibrate(loop.perception.thrust, config, case.wave)
         truth = BeatTruth()
         for index in range(round(case.seconds / tick_s)):
             phase = math.fmod(index * tick_s, case.rest_period)

@@ -82,8 +82,9 @@ def run(package: str, names: Sequence[str]) -> int:
         print(msgspec.json.encode(report.figures).decode() if options.json else text)
         if options.write:
             for marker, section in report.sections.items():
-                number = report.number
-                put(_page_with(marker), marker, number or section, in_line=bool(number))
+                if page := _page_with(marker):
+                    number = report.number
+                    put(page, marker, number or section, in_line=bool(number))
             if report.errors:
                 _write_errors({**read_errors(), **report.errors})
     return int(any(report.broken for report in reports))
@@ -138,8 +139,8 @@ def progress(*words: str) -> None:
 
 def table(head: str, rows: Iterable[Iterable[str]]) -> str:
     """Return a table in Markdown; the cells of its head are separated by " | "."""
-    rule = " | ".join("---" for _ in head.split(" | "))
-    return "\n".join(f"| {line} |" for line in (head, rule, *map(" | ".join, rows)))
+    rule = "|" + "---|" * len(head.split(" | "))
+    return "\n".join((f"| {head} |", rule, *(f"| {' | '.join(row)} |" for row in rows)))
 
 
 def put(document: Path, name: str, text: str, *, in_line: bool = False) -> None:
@@ -180,12 +181,12 @@ def write_reference(tool: str, sections: Iterable[tuple[str, str, str]]) -> int:
     return status
 
 
-def _page_with(name: str) -> Path:
-    """Return the page with the markers of `name`; raises SystemExit where there is none."""
+def _page_with(name: str) -> Path | None:
+    """Return the page that shows the table of `name`; None for a table that no page shows."""
     for page in sorted(DOCS.rglob("*.md")):
         if f"<!-- {name}: begin -->" in page.read_text(encoding="utf-8"):
             return page
-    raise SystemExit(f"{DOCS}: no page has the markers of '{name}'")
+    return None
 
 
 def _parted(document: Path, name: str) -> tuple[str, str, str]:

@@ -88,7 +88,7 @@ def _swum() -> tuple[list[float], ...]:
         run.set_controller("square", {"frequency": float(best.frequency[0])})
         reversals = first = 0
         while reversals <= BEATS:
-            commands.append(run.loop.applied)
+            commands.append(run.loop.instruction_angle)
             thrusts.append(1e3 * run.tick().thrust)
             sides.append(commands[-1] > 0.0)
             up = len(sides) > 1 and sides[-1] and not sides[-2]

@@ -92,8 +92,8 @@ class Memory:
 
 def check(loop: ControlLoop) -> None:
     """Check that the current angle is within limits."""
-    if not abs(loop.applied) <= 0.42 + 1e-9:
-        raise BrokenPromise(f"tick {loop.seq}: the present angle is {loop.applied} rad")
+    if not abs(loop.instruction_angle) <= 0.42 + 1e-9:
+        raise BrokenPromise(f"tick {loop.seq}: the present angle is {loop.instruction_angle} rad")
 
 
 def soak_simulated(ticks: int, seed: int) -> str:

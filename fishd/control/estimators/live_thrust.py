@@ -9,7 +9,7 @@ In a steady swim every pair of zero and factor with the same sum explains the fo
 a steady swim says nothing about the factor, however long it lasts; only a change of the power does:
 from rest to swimming and back, from one wave or one amplitude to another. The factor is updated at
 such changes alone, once for each, from the difference of the forces just before and just after it;
-between two changes its variance only grows. docs/how-to/measuring.md has the argument in full.
+between two changes its variance only grows. docs/explanation/accuracy.md has the argument.
 """
 
 import math

@@ -136,7 +136,7 @@ def swim(
         track = Track()
         if resume:
             resume.put_into(fish)
-            run.loop.applied = fish.command  # the new controller starts from this angle
+            run.loop.instruction_angle = fish.command  # the new controller starts from this angle
             track = Track(resumed_rows)
         resumed_ticks = len(track)
         track.begin(fish)
@@ -152,7 +152,7 @@ def swim(
             writer.write(fish, track, midlines, settings, name, parameter_values, command)
 
         while len(track) < ticks:
-            command = run.loop.applied
+            command = run.loop.instruction_angle
             run.tick()
             if fish.trouble:
                 break

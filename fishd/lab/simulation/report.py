@@ -143,7 +143,7 @@ def judge(
         for index in range(ticks):
             if index == first:  # the first ticks are slower, as they fill caches
                 since = time.perf_counter()
-            angle = virtual.loop.applied
+            angle = virtual.loop.instruction_angle
             window = virtual.tick()
             if virtual.loop.active.fallback and took_over_at is None:
                 took_over_at = index * config.tick

@@ -125,7 +125,7 @@ def swim(
         on_start(run)
         run.loop.set_controller(point.controller, controller)
         for index in range(max_ticks):
-            angle = run.loop.applied
+            angle = run.loop.instruction_angle
             window = run.tick()
             if index > settle:
                 beats.add(angle, window)
@@ -273,7 +273,7 @@ def swim_freely(
         reversals = Reversals()
         first: int | None = None
         while first is None and not _is_long_enough(track, beat_starts, lengths, config.tick):
-            command = run.loop.applied
+            command = run.loop.instruction_angle
             run.tick()
             problem = fish.trouble or run.loop.supervisor.reason or run.loop.active.fallback
             if problem:

@@ -224,6 +224,9 @@ def test_a_tick_from_before_a_request_is_not_taken_for_a_tail_that_stands_still(
         daemon.run.tick()
     tail = servo.Tail(cast(Fish, daemon), ServoCalibration())
     assert tail.move_to(0.1)
-    assert (tail.angle, daemon.run.loop.applied) == (pytest.approx(0.1), pytest.approx(0.1))
+    assert (tail.angle, daemon.run.loop.instruction_angle) == (
+        pytest.approx(0.1),
+        pytest.approx(0.1),
+    )
     tail.go_to_neutral()
-    assert (tail.angle, daemon.run.loop.applied) == (0.0, 0.0)
+    assert (tail.angle, daemon.run.loop.instruction_angle) == (0.0, 0.0)

@@ -202,7 +202,7 @@ def test_an_estimate_that_is_not_finite_is_a_fault_and_is_not_kept(
     assert math.isfinite(rig.recorder.ticks[-1].fin_velocity)
     assert_neutral_then_off(rig, broke, limit=0.05 + FADE_S)
     assert_recovers_by_clear_fault_only(rig)
-    thrust, error = rig.loop.known_thrust
+    thrust, error = rig.loop.perception.known_thrust
     assert error is not None
     assert math.isfinite(thrust + error)
 

@@ -83,7 +83,9 @@ def test_any_finite_real_number_is_an_angle(name: str) -> None:
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_command_that_is_not_a_finite_real_number_is_refused_with_its_type(name: str) -> None:
-    with pytest.raises(ValueError, match=r"the command is (of type \w+, not one real|nan|inf)"):
+    with pytest.raises(
+        ValueError, match=r"the instruction angle is (of type \w+, not one real|nan|inf)"
+    ):
         Guard(0.42, 0.05, None, 0.4).apply(BAD[name], 0.0)
 
 

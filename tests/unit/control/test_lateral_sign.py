@@ -46,7 +46,7 @@ def detect_reversal(rig: Rig, controller: str = "swing", **parameters: object) -
     rig.run_for(REST_S)
     rig.start(controller, **parameters)
     rig.run_for(1.0)
-    return rig.loop.lateral_sign.reversed
+    return rig.loop.perception.lateral_sign.reversed
 
 
 @pytest.mark.parametrize("seed", range(FIRST_SEED, FIRST_SEED + HARSH_FISH_COUNT))
@@ -61,7 +61,7 @@ def test_a_reversed_force_is_detected_on_any_fish_when_it_sets_off(seed: int) ->
 def test_a_reversed_force_is_detected_at_other_ticks_too(tick: float) -> None:
     right = Rig(f"tick={tick}")
     assert detect_reversal(right) is False
-    assert right.loop.lateral_sign.complaint == ""
+    assert right.loop.perception.lateral_sign.complaint == ""
     assert "calibration" not in right.recorder.kinds()
     assert detect_reversal(Rig(f"tick={tick}", wrap=reversed_robot)) is True
 
@@ -70,7 +70,7 @@ def test_a_reversed_force_is_reported_once_in_one_line_with_its_remedy() -> None
     rig = Rig(wrap=reversed_robot)
     assert [detect_reversal(rig) for _ in range(2)] == [True, True]
     (event,) = (event for event in rig.recorder.events if event.kind == "calibration")
-    assert (event.level, event.message) == ("warning", rig.loop.lateral_sign.complaint)
+    assert (event.level, event.message) == ("warning", rig.loop.perception.lateral_sign.complaint)
     assert event.message.startswith("F_y is reversed: ")
     assert "fishctl calibrate force" in event.message
     assert "fishctl calibrate servo" in event.message
@@ -97,13 +97,13 @@ def test_a_push_with_a_suspect_force_decides_nothing(tick: int) -> None:
     robot.fy, robot.suspect = None, ""
     rig.start("swing")
     rig.run_for(1.0)
-    assert rig.loop.lateral_sign.reversed is None
+    assert rig.loop.perception.lateral_sign.reversed is None
 
 
 def test_a_push_without_a_rest_or_small_or_short_or_hidden_by_noise_decides_nothing() -> None:
     restless = Rig().start("swing")
     restless.run_for(5.0)
-    assert restless.loop.lateral_sign.reversed is None
+    assert restless.loop.perception.lateral_sign.reversed is None
     for overrides, parameters in (
         ((), {"amplitude": 0.001, "frequency": 1.0}),
         ((), {"frequency": 10.0}),
@@ -118,22 +118,22 @@ def test_a_policy_with_small_movements_at_first_is_judged_by_its_first_large_pus
     for angle, ticks in ((-0.03, 4), (0.42, 10)):
         rig.start("hold", angle=angle)
         rig.run(ticks)
-    assert rig.loop.lateral_sign.reversed is True
+    assert rig.loop.perception.lateral_sign.reversed is True
 
 
 def test_a_new_calibration_resets_the_sign_and_a_tare_requires_a_rest() -> None:
     rig = Rig(wrap=reversed_robot)
     assert detect_reversal(rig) is True
-    assert rig.loop.fy_corrected
-    rig.loop.forget_force(scale=True)
+    assert rig.loop.perception.estimator.fy_corrected
+    rig.loop.perception.forget_force(scale=True)
     assert rig.run()[0].fy_corrected is UNSET
-    assert rig.loop.lateral_sign.complaint == ""
+    assert rig.loop.perception.lateral_sign.complaint == ""
     rig.loop.stop()
     rig.run_for(REST_S)
-    rig.loop.lateral_sign.rest()
+    rig.loop.perception.lateral_sign.rest()
     rig.start("swing")
     rig.run_for(1.0)
-    assert rig.loop.lateral_sign.reversed is None
+    assert rig.loop.perception.lateral_sign.reversed is None
     assert detect_reversal(rig) is True
 
 
@@ -195,15 +195,15 @@ def test_with_refuse_the_first_push_is_a_fault_and_the_next_start_is_refused() -
     # This controller ignores the force
     assert detect_reversal(rig, "square", frequency=1.5) is True
     assert rig.mode == "running"
-    rig.loop.forget_force(scale=True)
+    rig.loop.perception.forget_force(scale=True)
     rig.start("swing")
 
 
 def test_with_warn_nothing_is_corrected() -> None:
     rig = Rig("estimator.reversed_fy=warn", wrap=reversed_robot)
     assert detect_reversal(rig) is True
-    assert not rig.loop.fy_corrected
-    assert "so swing and policies fail" in rig.loop.lateral_sign.complaint
+    assert not rig.loop.perception.estimator.fy_corrected
+    assert "so swing and policies fail" in rig.loop.perception.lateral_sign.complaint
 
 
 class Touched(ReversedSensor):
@@ -239,5 +239,5 @@ def test_a_disturbance_changes_no_known_sign_and_its_wrong_first_sign_does_not_l
         rig.run_for(0.5)
         sensors[0].touched = False
         rig.run_for(0.5)
-        corrections.append(rig.loop.fy_corrected)
+        corrections.append(rig.loop.perception.estimator.fy_corrected)
     assert tuple(corrections) == corrected

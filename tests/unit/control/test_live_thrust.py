@@ -71,7 +71,7 @@ def test_a_measured_thrust_is_known_to_four_percent_for_an_hour() -> None:
     with rig() as fish:
         ticks = fish.swim("swing", {}, 20.0)
         power = sum(tick.fin_velocity**2 for tick in ticks[-240:]) / 240
-        fish._run.loop.thrust.calibrate(TRUTH / power, 0.2e-3 / power)
+        fish._run.loop.perception.thrust.calibrate(TRUTH / power, 0.2e-3 / power)
         thrust, ci95 = thrust_and_ci95(fish.swim("swing", {}, 3600.0))
         assert abs(thrust - TRUTH) < ci95 < 0.04 * TRUTH
 
@@ -86,7 +86,7 @@ def test_a_measured_factor_is_used_at_once_and_without_a_zero() -> None:
     with rig() as fish:
         ticks = fish.swim("swing", {}, 20.0)
         power = sum(tick.fin_velocity**2 for tick in ticks[-240:]) / 240
-        fish._run.loop.thrust.calibrate(TRUTH / power, 0.2e-3 / power)
+        fish._run.loop.perception.thrust.calibrate(TRUTH / power, 0.2e-3 / power)
         thrust, error = thrust_and_ci95(fish.swim("swing", {}, 8.0))
         assert thrust == pytest.approx(TRUTH, abs=0.3e-3)
         assert 0.01 * TRUTH < error < 0.6e-3  # no wave is known better
@@ -94,18 +94,18 @@ def test_a_measured_factor_is_used_at_once_and_without_a_zero() -> None:
 
 def test_the_interval_of_a_measured_factor_is_the_measured_one() -> None:
     with rig() as fish:
-        fish._run.loop.thrust.calibrate(68.4, 20.0)
+        fish._run.loop.perception.thrust.calibrate(68.4, 20.0)
         fish.rest(1.0)
-        assert fish._run.loop.thrust.factor == pytest.approx((68.4, 20.0), rel=0.01)
+        assert fish._run.loop.perception.thrust.factor == pytest.approx((68.4, 20.0), rel=0.01)
 
 
 def test_a_new_zero_of_the_sensor_is_found_again_and_the_factor_stays() -> None:
     with rig() as fish:
         fish.rest(3.0)
         fish.swim("swing", {}, 8.0)
-        fish._run.loop.thrust.forget_zero()
+        fish._run.loop.perception.thrust.forget_zero()
         assert abs(thrust_and_ci95(fish.swim("swing", {}, 8.0))[0] - TRUTH) < 3e-3
-        fish._run.loop.thrust.forget()
+        fish._run.loop.perception.thrust.forget()
         assert fish.swim("swing", {}, 8.0)[-1].thrust_ci95 is UNSET
 
 
@@ -153,7 +153,7 @@ def test_a_factor_that_overflows_does_not_stop_the_fish() -> None:
     with rig() as fish:
         fish.rest(3.0)
         fish.swim("swing", {}, 6.0)
-        fish._run.loop.thrust.calibrate(1e150, 1e150)
+        fish._run.loop.perception.thrust.calibrate(1e150, 1e150)
         ticks = fish.swim("swing", {}, 10.0)
         assert {tick.mode for tick in ticks} == {"running"}
 

@@ -321,7 +321,7 @@ def test_no_field_of_a_tick_keeps_a_value_of_the_controller(mode: str, may_stay:
     rig.run(60)  # so that the zero of the force is known
     rig.start("square", frequency=4.9)
     rig.run(39, missed=1, lateness=5e-3)
-    rig.loop.thrust.calibrate(70.0, 0.5)  # since these forces do not determine it
+    rig.loop.perception.thrust.calibrate(70.0, 0.5)  # since these forces do not determine it
     running = rig.run(1, missed=1, lateness=5e-3)[-1]
     leave = {
         "idle": rig.loop.stop,
@@ -352,4 +352,4 @@ def test_only_the_active_controller_warms_up_and_the_angle_stays() -> None:
     rig.start(controller)
     rig.run()
     rig.loop.warm_up()
-    assert (ticks, rig.loop.applied, rig.loop.seq) == ([1], 0.1, 1)
+    assert (ticks, rig.loop.instruction_angle, rig.loop.seq) == ([1], 0.1, 1)

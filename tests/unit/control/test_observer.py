@@ -66,7 +66,7 @@ def test_a_strongly_damped_fin_is_observed_as_well() -> None:
 
 def test_a_reversed_lateral_force_leaves_the_motion_unknown_and_the_offset_reversed() -> None:
     rig = Rig(OBSERVER, *REAL).start("square", frequency=1.7)
-    observer = rig.loop._estimator
+    observer = rig.loop.perception.estimator
     assert isinstance(observer, Observer)
     unknown = observer._covariance
     rig.run_for(10)

@@ -35,7 +35,7 @@ def rested(*overrides: str, factor: float | None = FACTOR) -> Rig:
     rig = Rig(*RIG, *overrides)
     rig.run_for(3)
     if factor is not None:
-        rig.loop.thrust.calibrate(factor, 0.006 * factor)
+        rig.loop.perception.thrust.calibrate(factor, 0.006 * factor)
     return rig
 
 
@@ -118,7 +118,7 @@ def test_what_was_measured_of_swing_holds_for_it() -> None:
     rig.run_for(8)
     rig.loop.stop()
     rig.run_for(3)
-    rig.loop.thrust.calibrate(FACTOR, 0.006 * FACTOR)
+    rig.loop.perception.thrust.calibrate(FACTOR, 0.006 * FACTOR)
     rig.start("thrust", target=0.020)
     known = rig.run(1)[-1]
     assert known.thrust_factor == pytest.approx(FACTOR)

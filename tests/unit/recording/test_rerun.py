@@ -60,7 +60,7 @@ def test_a_reversed_force_that_was_corrected_is_corrected_again(tmp_path: Path, 
     rig.run_for(3)
     rig.start("swing")
     rig.run_for(5)
-    assert rig.loop.fy_corrected
+    assert rig.loop.perception.estimator.fy_corrected
     result = rerun_of(rig, tmp_path / "run")
     assert [(stretch.equal, stretch.ticks) for stretch in result.stretches] == [(100, 100)]
     assert result.estimates.equal == result.estimates.ticks == len(rig.recorder.ticks)
@@ -68,7 +68,7 @@ def test_a_reversed_force_that_was_corrected_is_corrected_again(tmp_path: Path, 
 
 def test_a_thrust_that_was_held_by_a_measured_factor_is_held_by_it_again(tmp_path: Path) -> None:
     rig = Rig("simulation.noise=0.002")
-    rig.loop.thrust.calibrate(68.0, 0.5)
+    rig.loop.perception.thrust.calibrate(68.0, 0.5)
     rig.start("thrust", target=0.01)
     rig.run_for(10)
     stretch = rerun_of(rig, tmp_path / "run").stretches[0]
@@ -161,7 +161,7 @@ def test_a_new_zero_of_the_force_sensor_is_one_for_the_rerun_too(tmp_path: Path)
     robot.fy = 1.0
     rig.run_for(3)
     robot.fy = None
-    rig.loop.forget_force(scale=False)
+    rig.loop.perception.forget_force(scale=False)
     rig.loop.reporter.event("calibration", "force sensor: a.yaml", file="a.yaml")
     rig.run_for(1)
     rig.start("swing")

@@ -63,8 +63,9 @@ def test_chatter_gives_swing_command_in_two_seconds(
     assert event.message in caplog.text
     assert rig.loop.active.fallback
     assert rig.loop.active.fallback.code == "chatter"
-    assert rig.loop.observation
-    assert rig.loop.observation.frequency == pytest.approx(1.7, abs=0.2)  # the fish swims
+    seen = rig.loop.perception.observation
+    assert seen
+    assert seen.frequency == pytest.approx(1.7, abs=0.2)  # the fish swims
 
 
 def test_it_is_a_fault_where_that_is_configured(tmp_path: Path) -> None:

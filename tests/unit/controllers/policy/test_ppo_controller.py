@@ -96,7 +96,7 @@ def test_an_output_that_is_not_finite_in_the_tick_is_a_fault_at_neutral(tmp_path
     assert first.phi_c == 0.42  # √1e6, cut to 1
     assert (rig.mode, rig.reason) == ("fault", "controller-error")
     assert rig.loop.supervisor.reason
-    assert "the command is nan, not an angle" in rig.loop.supervisor.reason.message
+    assert "the instruction angle is nan, not a finite number" in rig.loop.supervisor.reason.message
     assert (last.controller, last.phi_c) == ("hold", 0.0)
 
 
