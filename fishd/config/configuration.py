@@ -378,7 +378,11 @@ CHECKS: tuple[Check, ...] = (
     lambda c: check_lockstep(c.robot, c.lockstep),
     lambda c: check_estimator(c.robot, c.estimator.kind, c.plant),
     lambda c: check_virtual_pi(c.virtual_pi),
-    lambda c: None if c.kind.is_tethered else check_swimmer(c.swimmer, c.tick, c.plant.servo_law),
+    lambda c: (
+        None
+        if c.kind.is_tethered
+        else check_swimmer(c.swimmer, c.tick, c.plant.servo_law, c.estimator.kind)
+    ),
 )
 """Checks of keys against each other, in order; each raises `Problem`."""
 

@@ -196,7 +196,7 @@ def check_estimator(robot: str, kind: str, plant: PlantParameters) -> None:
         raise Problem(
             ("estimator", "kind"),
             "observer is not valid with robot: swimmer, since its model is of a tethered fish; "
-            "sensor or lateral_force is needed",
+            "tail, sensor or lateral_force is needed",
         )
     if kind in ("sensor", "tail") and find_kind(robot).is_tethered:
         raise Problem(
@@ -212,7 +212,7 @@ def check_estimator(robot: str, kind: str, plant: PlantParameters) -> None:
         )
 
 
-def check_swimmer(swimmer: SwimmerSettings, tick: float, servo_law: str) -> None:
+def check_swimmer(swimmer: SwimmerSettings, tick: float, servo_law: str, estimator: str) -> None:
     """Check that a swimmer can be computed.
 
     tick: period of the loop [s]; servo_law: law of the servo that its muscle may follow
@@ -226,6 +226,8 @@ def check_swimmer(swimmer: SwimmerSettings, tick: float, servo_law: str) -> None
         )
 
     feasibility.check(swimmer)
+    if estimator == "tail":
+        feasibility.check_tail(swimmer)
     step = swimmer.numerics.step
     steps = max(1, round(tick / step))
     if abs(tick / step - steps) > 1e-6:
