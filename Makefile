@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 AHEAD := $(shell [ "$$(nice -n -20 nice 2>/dev/null)" = -20 ] && echo nice -n -20)
 
-.PHONY: help run test test-realtime test-fast lint docs docs-versions figures vendor bench clean
+.PHONY: help run test test-realtime test-fast lint docs figures vendor bench clean
 
 help:  ## List what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 15
@@ -50,13 +50,10 @@ docs: $(VENV)/installed-docs  ## Write the generated parts of docs/, and build b
 	$(SPHINX) -b man docs build/docs/man
 	@echo "Open build/docs/html/README.html, or: man build/docs/man/fishctl.1"
 
-docs-versions: $(VENV)/installed-docs  ## Build the site of each tag and of the checkout into build/site
-	$(BIN)/python tools/site_versions.py
-
 figures: $(VENV)/installed-dev  ## Compute the paper's figures and numbers again, into docs/
 	$(BIN)/python tools/paper
 
-vendor: $(VENV)/bin/python  ## Fetch the libraries of the window's page and of tests again, with npm, and verify them
+vendor: $(VENV)/bin/python  ## Fetch the libraries of the window's page again, with npm, and verify them
 	$(BIN)/python tools/vendor.py
 
 bench: $(VENV)/installed-dev  ## Measure lateness, load and start-up on this machine

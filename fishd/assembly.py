@@ -21,11 +21,12 @@ from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.estimators.observer import Observer
 from fishd.control.guard import Guard
 from fishd.control.loop import ControlLoop
-from fishd.core import files
+from fishd.core import files, text
 from fishd.core.addresses import virtual_pi_socket
 from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.clock import Clock, SystemClock, VirtualClock
-from fishd.core.errors import MissingPackage, SensorError
+from fishd.core.errors import FishdError, SensorError, StartupError
+from fishd.core.foreign_code import call_foreign
 from fishd.core.signals import Publisher, Truth
 from fishd.hardware import ownership, release_recipe
 from fishd.hardware.base import CalibratedParts, Robot
@@ -38,13 +39,11 @@ from fishd.hardware.servo import pulses
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio import Pigpio
 from fishd.virtual.fish import SimulatedFish
-from fishd.virtual.plant.base import TrueWindow
 
 if TYPE_CHECKING:  # most runs need neither drivers nor emulation, so they are loaded on demand
     from fishd.hardware.panel import Panel
     from fishd.hardware.power_meter.sampled_power import SampledPower
     from fishd.virtual.pi.virtual_pi import VirtualPi
-    from fishd.virtual.swimmer.robot import Swimmer
 
 log = logging.getLogger(__name__)
 
@@ -71,17 +70,13 @@ def open_robot(
     stack.push(recipes.remove_at_end)
     if not config.kind.has_hardware:
         recipes.write_without_servo()
-    if config.robot == "simulated":
         if file and not (release_recipe.read(str(file)) or {}).get("fresh"):
             release_recipe.remove(str(file))  # of an earlier content of the file
-        return dataclasses.replace(simulated_fish(config).robot(), write_recipes=recipes.write_for)
-    if config.robot == "swimmer":
-        swimmer = open_swimmer(config)
-        swimmer.compile()
-        return dataclasses.replace(swimmer.robot(), write_recipes=recipes.write_for)
+        robot: Robot = open_fish(config).robot()
+        return dataclasses.replace(robot, write_recipes=recipes.write_for)
     stack.enter_context(ownership.claim_parts(parts_of(config)))
     recipes.remove_former()
-    if config.robot == "virtual-pi":
+    if config.kind.is_virtual:
         plug_in_virtual_pi(config, stack)
     return assemble(config, clock, stack, threaded=True, recipes=recipes)
 
@@ -91,29 +86,27 @@ def simulated_fish(config: Config) -> SimulatedFish:
     return SimulatedFish(config.plant, config.simulation, config.tick)
 
 
-def open_swimmer(config: Config) -> "Swimmer":
-    """Return a fish that swims freely; raise `MissingPackage` if a package is missing."""
+def open_fish(config: Config) -> Any:
+    """Return the fish of a robot without drivers, as `RobotKind.open` describes it.
+
+    Raises `MissingPackage`, and `StartupError` where a robot of another package cannot start.
+    """
     try:
-        from fishd.virtual.swimmer.robot import Swimmer
-    except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
-        raise MissingPackage.of_extra("robot: swimmer", package, "swimmer") from None
-    return Swimmer(
-        config.swimmer,
-        config.plant,
-        config.amplitude_limit,
-        config.tick,
-        senses_tail=config.estimator.kind == "tail",
-    )
+        return call_foreign(config.kind.open, config) or simulated_fish(config)
+    except FishdError:
+        raise
+    except Exception as error:
+        message = f"robot '{config.robot}' cannot start: {text.describe_error(error)}"
+        raise StartupError(message) from error
 
 
 def parts_of(config: Config) -> tuple[ownership.Part, ...]:
     """Return the parts that no other fishd may drive; `fishctl release` ignores such claims."""
-    if config.robot == "pi":
-        return ownership.parts_of_pi(claims_of(config.driver_settings))
-    if config.robot == "virtual-pi":
+    if not config.kind.has_hardware:
+        return ()
+    if config.kind.is_virtual:
         return ownership.parts_of_virtual_pi(virtual_pi_socket(config.virtual_pi.socket))
-    return ()
+    return ownership.parts_of_pi(claims_of(config.driver_settings))
 
 
 class InVirtualTime(NamedTuple):
@@ -155,29 +148,16 @@ def open_in_virtual_time(config: Config, stack: ExitStack) -> InVirtualTime:
     return InVirtualTime(robot, pi)
 
 
-class FishInVirtualTime(NamedTuple):
-    """Fish in virtual time, of every robot that a configuration can name."""
-
-    robot: Robot
-    take_window: Callable[[], TrueWindow]
-    """Function that returns the true motion since its previous call."""
-    swimmer: "Swimmer | None" = None
-    """The fish itself if it swims freely."""
-
-
-def open_fish_in_virtual_time(config: Config, stack: ExitStack) -> FishInVirtualTime:
-    """Return a simulated fish, free, on its rod or behind a virtual Pi.
+def open_fish_in_virtual_time(config: Config, stack: ExitStack) -> tuple[Robot, Any]:
+    """Return a robot in virtual time, and its fish, as `RobotKind.open` describes it.
 
     Raises `MissingPackage` if a package is missing.
     """
-    if config.robot == "swimmer":
-        swimmer = open_swimmer(config)
-        return FishInVirtualTime(swimmer.robot(), swimmer.take_window, swimmer)
-    if config.robot == "virtual-pi":
+    if config.kind.is_virtual:
         robot, pi = open_in_virtual_time(config, stack)
-        return FishInVirtualTime(robot, pi.tank.take_window)
-    fish = simulated_fish(config)
-    return FishInVirtualTime(fish.robot(), fish.take_window)
+        return robot, pi.tank
+    fish = open_fish(config)
+    return fish.robot(), fish
 
 
 def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:
@@ -292,8 +272,8 @@ def assemble(
 
     if permitted := pulses.format_reach(settings, config.amplitude_limit):
         log.info("servo.lowest and servo.highest permit %s, amplitude_limit", permitted)
-    if line := _calibration_warning(config, servo):
-        log.warning("%s", line)
+    if warning := _calibration_warning(config, servo):
+        log.warning("%s", warning)
 
     def limitations() -> tuple[str, ...]:
         lines = (
@@ -379,11 +359,11 @@ def open_sensor(
     )
 
 
-def _calibration_warning(config: Config, servo: CalibratedServo) -> str:
-    """Return a line if the calibration of the servo does not permit ±Φ; empty if it does."""
+def _calibration_warning(config: Config, servo: CalibratedServo) -> str | None:
+    """Return a line if the calibration of the servo does not permit ±Φ; None if it does."""
     permitted = servo.format_reach(config.amplitude_limit)
     if not permitted or servo.calibration == config.servo.calibration:
-        return ""
+        return None
     return (
         f"the servo's calibration of {servo.calibration.date or 'no date'} permits {permitted}, "
         "amplitude_limit: fishctl calibrate servo"

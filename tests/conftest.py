@@ -1,7 +1,9 @@
 """Settings of all tests: which are fast, what is reported, how many threads compute."""
 
+import asyncio
 import contextlib
 import gc
+import inspect
 import os
 import signal
 import subprocess
@@ -17,6 +19,7 @@ from _pytest.runner import runtestprotocol
 from hypothesis import HealthCheck, settings
 from rigs import forked_workers, own_network
 
+from common.processes import PATIENCE
 from fishd.core.process import unix_sockets
 
 # Each process computes with one thread; set before numpy or torch is loaded, here or in a child.
@@ -210,6 +213,17 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
     for report in reports:
         item.ihook.pytest_runtest_logreport(report=report)
     item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+    return True
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run a test that is a coroutine, within a generous time."""
+    if not inspect.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    names = pyfuncitem._fixtureinfo.argnames
+    arguments = {name: pyfuncitem.funcargs[name] for name in names}
+    asyncio.run(asyncio.wait_for(pyfuncitem.obj(**arguments), PATIENCE))
     return True
 
 

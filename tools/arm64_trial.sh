@@ -6,7 +6,7 @@
 #
 # WORK   a folder that keeps the bare Debians and the logs; /var/tmp/fishd-arm64-trial if not set
 # DEBIAN what debootstrap takes for a mirror, if not its own
-# How pip and apt reach their packages is inherited from this machine: proxy, index, certificate.
+# How apt reaches its packages is inherited from this machine.
 set -euo pipefail
 checkout=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 WORK=${WORK:-/var/tmp/fishd-arm64-trial}
@@ -37,40 +37,23 @@ check_machine() {
   update-binfmts --enable qemu-aarch64
 }
 
-# What this machine's pip and shell know of the network, as variables.
-network() {
-  local name
-  for name in http_proxy https_proxy no_proxy; do
-    if [[ -n ${!name:-} ]]; then echo "$name=${!name}"; fi
-  done
-  python3 -m pip config list |
-    sed -nE "s/^[^.]*\.(index-url|proxy|trusted-host|default-timeout|cert)='(.*)'\$/\1 \2/p" |
-    while read -r name value; do
-      name=${name//-/_}
-      echo "PIP_${name^^}=$value"
-    done
-}
-
-# This machine's way to the network, for the root.
+# This machine's way to Debian's packages, for the root.
 connect() {
-  local root=$1 certificate
+  local root=$1
   cp --dereference /etc/resolv.conf "$root/etc/resolv.conf"
   apt-config dump | grep -E '^Acquire::(https?::|Check-)' >"$root/etc/apt/apt.conf.d/99host" || true
-  certificate=$(network | sed -n 's/^PIP_CERT=//p' | tail -n 1)
-  if [[ -n $certificate ]]; then install -D -m 644 "$certificate" "$root$certificate"; fi
 }
 
 # Runs a command in the root, with nothing of this machine but its way to the network.
 inside() {
-  local root=$1 variables
+  local root=$1
   shift
-  mapfile -t variables < <(network)
   # In namespaces of its own: mounts and processes are gone with it.
   # shellcheck disable=SC2016
   timeout "$LONGEST" unshare --mount --pid --fork --kill-child bash -c '
     mount -t proc proc "$0/proc" && mount --rbind /dev "$0/dev" && exec chroot "$0" env -i "$@"' \
     "$root" QEMU_CPU="$PROCESSOR" PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin HOME=/root \
-    LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive "${variables[@]}" "$@"
+    LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive "$@"
 }
 
 # A bare Debian; kept for the next time.

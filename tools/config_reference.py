@@ -103,7 +103,7 @@ def _row(field: Field, default: object, prefix: str) -> list[str]:
         permitted += ", or `null`"
     value = f"`{_to_yaml(default)}`"
     cells = (f"`{prefix}{field.name}`", permitted, value, field.description)
-    return [cell.replace("|", r"\|") for cell in cells]
+    return [cell.replace(" | ", ", ").replace("|", r"\|") for cell in cells]
 
 
 def _to_yaml(value: object) -> str:

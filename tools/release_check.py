@@ -21,7 +21,6 @@ CHECKS: dict[str, list[str]] = {
     "lint": ["make", "lint"],
     "docs": ["make", "docs"],
     "docs links": [*PYTEST, "tests/unit/docs"],
-    "docs versions": ["make", "docs-versions"],
     "examples": [*PYTEST, "tests/system/docs", "tests/system/test_docs_examples.py"],
     "tests": ["make", "test"],
     "real-time tests": ["make", "test-realtime"],

@@ -1,10 +1,8 @@
-"""Fetch the libraries of the window's page and of tests again, as manifest.json names them.
+"""Fetch the libraries of the window's page again, as manifest.json names them.
 
 `tools/vendor.py` runs `npm pack` for each package, compares the archive with npm's integrity and
 each file with its SHA-256, and writes the files. To change a version, edit it in manifest.json, and
 empty `integrity` and `sha256`: they are then filled in.
-
-The reader of recordings that a test uses has many files: esbuild makes one of them.
 """
 
 import base64
@@ -14,13 +12,11 @@ import subprocess
 import sys
 import tarfile
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 VENDOR = ROOT / "fishd" / "window" / "page" / "vendor"
-OF_TESTS = ROOT / "tests" / "rigs" / "vendor"
 
 
 def fetch(package: dict[str, Any], folder: Path) -> None:
@@ -51,44 +47,13 @@ def check(what: str, entry: dict[str, Any], key: str, value: str) -> None:
     entry[key] = value
 
 
-def make_bundle(manifest: dict[str, Any], folder: Path) -> None:
-    """Write one file of several packages, and their licences; exit if its hash differs."""
-    bundle, packages = manifest["bundle"], manifest["packages"]
-    names = [f"{name}@{version}" for name, version in packages.items()]
-    command = ["npm", "install", "--ignore-scripts", "--silent", "--prefix", str(folder), *names]
-    subprocess.run(command, check=True)
-    (folder / "source.mjs").write_text(bundle["source"], encoding="utf-8")
-    esbuild = [str(folder / "node_modules" / ".bin" / "esbuild"), "source.mjs", "--bundle"]
-    options = ["--platform=node", "--minify", "--legal-comments=inline", "--log-level=error"]
-    made = subprocess.run([*esbuild, *options], check=True, cwd=folder, capture_output=True)
-    check("the bundle", bundle, "sha256", hashlib.sha256(made.stdout).hexdigest())
-    (OF_TESTS / bundle["file"]).write_bytes(made.stdout)
-    licences = []
-    for name, version in packages.items():
-        if name != "esbuild":  # no code of it is in the file
-            (licence,) = (folder / "node_modules" / name).glob("LICENSE*")
-            text = licence.read_text(encoding="utf-8").replace("\r\n", "\n").strip()
-            licences.append(f"{name} {version}\n\n{text}\n")
-    (OF_TESTS / manifest["licences"]).write_text("\n".join(licences), encoding="utf-8")
-
-
 def main() -> None:
-    """Fetch all packages."""
-    update(OF_TESTS / "manifest.json", make_bundle)
-    update(VENDOR / "manifest.json", fetch_all)
-
-
-def fetch_all(manifest: dict[str, Any], folder: Path) -> None:
-    """Write the files of all packages."""
-    for package in manifest["packages"]:
-        fetch(package, folder)
-
-
-def update(path: Path, get: Callable[[dict[str, Any], Path], None]) -> None:
-    """Get what a manifest names, and store the manifest with its hashes."""
+    """Fetch all packages, and store the manifest with their hashes."""
+    path = VENDOR / "manifest.json"
     manifest = json.loads(path.read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory() as folder:
-        get(manifest, Path(folder))
+        for package in manifest["packages"]:
+            fetch(package, Path(folder))
     path.write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
 
 

@@ -15,7 +15,7 @@ from fishd.camera import messages, picture
 from fishd.camera.messages import FrameHeader, Until, ViewHeader
 from fishd.camera.monitor import Monitor
 from fishd.camera.settings import CameraSettings, without_password
-from fishd.camera.sockets import MAX_UNKNOWN_BYTES, Publisher, Requests
+from fishd.camera.sockets import Publisher, Requests
 from fishd.camera.sources.base import Shot, Source, Timeline, Trouble
 from fishd.core import text
 from fishd.core.camera_frames import Pixels
@@ -33,8 +33,6 @@ RESTART_DELAY_S = 1.0
 """Delay before a source that has failed is started again [s]."""
 STOP_TIMEOUT_S = 2.0
 """Longest wait for the source to release its camera [s]."""
-WARNING_PERIOD_S = 60.0
-"""Shortest time between two warnings of subscribers that were disconnected [s]."""
 _POLL_TIMEOUT_MS = 50
 """Longest wait for sockets between two checks of timers [ms]."""
 _MAX_QUEUED_JOBS = 4096
@@ -57,7 +55,7 @@ class Server:
         self._last_error = ""
         """Latest unexpected error of the source."""
         self._sessions = 0
-        self._next_view = self._next_state = self._next_warning = 0.0
+        self._next_view = self._next_state = 0.0
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -102,21 +100,7 @@ class Server:
     def _register_sockets(self) -> None:
         self._poller = zmq.Poller()
         for source in (self._publisher.socket, self._requests.socket, self._job_event):
-            if source is not None:
-                self._poller.register(source, zmq.POLLIN)
-
-    def _renew_publisher(self, now: float) -> None:
-        if not self._publisher.renew(now):
-            return
-        self._register_sockets()
-        if self._publisher.socket is None and now >= self._next_warning:
-            self._next_warning = now + WARNING_PERIOD_S
-            log.warning(
-                "%s: all subscribers were disconnected, and may connect again: they had "
-                "subscribed to more than %d kB of topics that are not published",
-                self._publisher.address,
-                MAX_UNKNOWN_BYTES // 1000,
-            )
+            self._poller.register(source, zmq.POLLIN)
 
     def _serve_ready(self, ready: set[object]) -> None:
         if self._job_event in ready:
@@ -125,7 +109,6 @@ class Server:
             self._requests.answer()
         state_requested = self._publisher.socket in ready and self._publisher.take_subscriptions()
         now = time.monotonic()
-        self._renew_publisher(now)
         silence = now - self._last_sign_of_life
         if silence > SOURCE_TIMEOUT_S:
             self._publish_state(

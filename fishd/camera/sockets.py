@@ -1,6 +1,5 @@
 """Sockets of `fishd-camera`: one publishes frames, the other receives requests."""
 
-import ctypes
 import os
 import socket as sockets
 from collections.abc import Callable, Iterator
@@ -9,7 +8,7 @@ from typing import Any
 
 import zmq
 
-from fishd.camera.messages import FRAME, STATE, UNTIL, VIEW
+from fishd.camera.messages import STATE, VIEW
 from fishd.core import addresses, protocol, text
 from fishd.core.errors import Refused
 from fishd.core.schema import suggest
@@ -21,11 +20,6 @@ MAX_TOPIC_BYTES = 512
 """Largest message from a subscriber [bytes]."""
 HANDSHAKE_TIMEOUT_MS = 2000
 """Longest time until a new connection has completed the ZeroMQ handshake [ms]."""
-MAX_UNKNOWN_BYTES = 50_000
-"""Largest total size of the unknown topics of all subscribers [bytes]."""
-RENEWAL_PAUSE_S = 0.3
-"""Time without connections after one has sent too many topics [s]."""
-_TOPICS = (FRAME, VIEW, STATE, UNTIL)
 _MAX_REQUESTS_PER_TURN = 20
 """Largest number of requests that are answered before frames are published."""
 _MAX_SUBSCRIPTIONS_PER_TURN = 1000
@@ -36,36 +30,28 @@ _ADVICE = "end it, or give this one another publish.frames and publish.requests"
 
 
 class Publisher:
-    """Non-blocking XPUB socket for frames, which reports the topics of its subscribers.
-
-    ZeroMQ stores each topic that a subscriber sends, and releases the memory only when the
-    connection ends. When the unknown topics exceed `MAX_UNKNOWN_BYTES`, all subscribers are
-    therefore disconnected; well-behaved ones reconnect by themselves.
-    """
+    """Non-blocking XPUB socket for frames, which reports the topics of its subscribers."""
 
     def __init__(self, address: str, stack: ExitStack) -> None:
         """Listen at an address; raises `StartupError`."""
-        self._listener, self.address = _listen(address, "publish.frames", stack)
+        listener, self.address = _listen(address, "publish.frames", stack)
         self.file = SocketFile(self, self.address, "publish.frames", group=False)
         self._topics: set[bytes] = set()
         """Subscriptions that match views: `view`, or a prefix of it."""
-        self._reopen_time = 0.0
-        self._open()
-        stack.callback(lambda: self._listener.close())
-        stack.callback(self._close)
+        self._stack = ExitStack()
+        stack.callback(lambda: self._stack.close())
+        self.listen_at(self.address, listener)
 
-    def listen_at(self, _: str, listener: sockets.socket) -> None:
+    def listen_at(self, address: str, listener: sockets.socket) -> None:
         """Listen at a new file from now on; all subscribers connect again."""
-        self._listener.close()
-        self._listener = listener.dup()
-        if self.socket is not None:
-            self._close()
-            self._open()
+        self._stack.close()
+        self._stack = ExitStack()
+        self._topics.clear()
+        self.socket = _bind(zmq.XPUB, address, listener, self._stack)
 
     def send(self, parts: list[bytes]) -> None:
         """Publish a message."""
-        if self.socket is not None:
-            self.socket.send_multipart(parts, zmq.DONTWAIT)
+        self.socket.send_multipart(parts, zmq.DONTWAIT)
 
     @property
     def views_wanted(self) -> bool:
@@ -77,9 +63,6 @@ class Publisher:
         state = False
         for (message,) in _receive(self.socket, 1, _MAX_SUBSCRIPTIONS_PER_TURN):
             kind, topic = message[:1], message[1:]
-            if not any(known.startswith(topic) for known in _TOPICS):
-                self._unknown_bytes += len(message) * (kind == b"\x01")
-                continue
             if kind == b"\x01":
                 if VIEW.startswith(topic):
                     self._topics.add(topic)
@@ -87,33 +70,6 @@ class Publisher:
             elif kind == b"\x00":
                 self._topics.discard(topic)
         return state
-
-    def renew(self, now: float) -> bool:
-        """Disconnect all subscribers where too many topics are unknown, and listen again later.
-
-        now: time of a monotonic clock [s]; returns whether `socket` was replaced
-        """
-        if self.socket is None and now >= self._reopen_time:
-            self._open()
-            return True
-        if self.socket is None or self._unknown_bytes <= MAX_UNKNOWN_BYTES:
-            return False
-        self._close()
-        self._reopen_time = now + RENEWAL_PAUSE_S
-        return True
-
-    def _open(self) -> None:
-        self._unknown_bytes = 0
-        self._topics.clear()
-        self._stack = ExitStack()
-        self.socket: zmq.Socket[bytes] | None = _bind(
-            zmq.XPUB, self.address, self._listener, self._stack
-        )
-
-    def _close(self) -> None:
-        self._stack.close()
-        self.socket = None
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 class Requests:
@@ -156,13 +112,12 @@ class Requests:
 
 
 def _receive(
-    socket: "zmq.Socket[bytes] | None",
+    socket: "zmq.Socket[bytes]",
     parts: int | None = None,
     count: int = _MAX_REQUESTS_PER_TURN,
 ) -> Iterator[list[bytes]]:
     """Yield at most `count` waiting messages, and only those with this number of parts."""
-    for _ in range(count if socket is not None else 0):
-        assert socket is not None
+    for _ in range(count):
         try:
             message = socket.recv_multipart(zmq.DONTWAIT)
         except zmq.Again:

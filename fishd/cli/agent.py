@@ -21,7 +21,7 @@ from fishd.core.signals import Observation
 
 if TYPE_CHECKING:
     from fishd.camera.live_sight import LiveSight
-    from fishd.controllers.policy.pilot import Pilot
+    from fishd.controllers.policy.runtime import Pilot
     from fishd.lab.links.fishd_link import FishdLink
 
 CAMERA_LOST_AFTER_S = 2.0
@@ -72,7 +72,7 @@ def agent(
     for package in ("onnx", "onnxruntime"):
         import_module(package)  # `Verbs` names the extra of a missing package
     from fishd.camera.live_sight import LiveSight
-    from fishd.controllers.policy.pilot import Pilot
+    from fishd.controllers.policy.runtime import Pilot
     from fishd.lab.links.fishd_link import FishdLink
     from fishd.lab.links.link import LinkLost
 

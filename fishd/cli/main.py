@@ -44,7 +44,7 @@ VERBS = {
     "Record": {
         "record": Verb("recording.record", "record", "Record a running fish into a file."),
         "runs": Verb("recording.runs", "runs", "List recordings and experiments."),
-        "plot": Verb("recording.files", "plot", "Draw a recording, as a picture and a page."),
+        "plot": Verb("recording.files", "plot", "Draw a recording as a picture."),
         "export": Verb("recording.files", "export", "Write a recording as CSV or Parquet."),
         "import": Verb(
             "recording.import_table", "import_table", "Make a recording of a table of another rig."
@@ -54,7 +54,7 @@ VERBS = {
         "recover": Verb("recording.files", "recover", "Repair a recording that was cut off."),
     },
     "Camera": {
-        "camera": Verb("camera", "camera", "Show the picture of the camera, set it up, record it."),
+        "camera": Verb("camera", "camera", "Show the picture of the camera, set it up."),
     },
     "Calibrate": {
         "tare": Verb("calibrate", "tare", "Set the force zero to the present force."),

@@ -8,13 +8,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fishd.cli.config import fish_options
-from fishd.cli.free_swim import (
-    DEFAULT_SETTLE_S,
-    SimulateGroup,
-    SwimmerOptions,
-    swim,
-    swimmer_options,
-)
 from fishd.cli.options import for_option, json_option
 from fishd.cli.output import (
     echo,
@@ -23,6 +16,13 @@ from fishd.cli.output import (
     format_criterion,
     print_json,
     warn_of_fin,
+)
+from fishd.cli.swimmer.simulation import (
+    DEFAULT_SETTLE_S,
+    FreeSwimOptions,
+    SimulateGroup,
+    free_swim_options,
+    swim,
 )
 from fishd.config import Config, load
 from fishd.core.console import format_power
@@ -44,7 +44,7 @@ def run_options(function: Any) -> Any:
         click.option(
             "--settle",
             type=float,
-            help="Time before measurements begin [s].  [default: 10; 8 for a swimmer]",
+            help="Time before measurements begin [s].  [default: 10; 8 if it swims freely]",
         ),
         for_option("Length of the run [s].", default=60.0, kind=click.FLOAT),
     ):
@@ -60,7 +60,7 @@ def _simulate_options(function: Any) -> Any:
         metavar="FILE",
         help="Record the run into this .mcap file, which must not exist.",
     )
-    return run_options(record(swimmer_options(function)))
+    return run_options(record(free_swim_options(function)))
 
 
 @click.group(cls=SimulateGroup, options=_simulate_options)
@@ -78,26 +78,26 @@ def _simulate(
     overrides: tuple[str, ...],
     recording: Path | None,
     as_json: bool,
-    **swimmers: Any,
+    **free_swims: Any,
 ) -> int:
-    swimmer_options_given = SwimmerOptions(**swimmers)
+    free_swim = FreeSwimOptions(**free_swims)
     from fishd.lab.simulation import check_whole_beat
     from fishd.lab.simulation import simulate as run
 
     config = load(file, overrides)
-    is_swimmer = not config.kind.is_tethered
+    is_free = not config.kind.is_tethered
     if settle is None:
-        settle = DEFAULT_SETTLE_S if is_swimmer else 10.0
+        settle = DEFAULT_SETTLE_S if is_free else 10.0
     with ExitStack() as stack:
         writer, on_start = None, _do_nothing
-        if not is_swimmer:
-            swimmer_options_given.refuse()
+        if not is_free:
+            free_swim.refuse()
         if recording:
             writer = stack.enter_context(_open_recording(recording))
             on_start = partial(_describe, writer, config)
-        if is_swimmer:
+        if is_free:
             run_arguments = (config, name, parameters, seconds, settle, writer, on_start)
-            return swim(run_arguments, swimmer_options_given, as_json)
+            return swim(run_arguments, free_swim, as_json)
         report = run(config, name, parameters, seconds, settle, writer, on_start)
     check_whole_beat(report, seconds, settle)
     if as_json:

@@ -18,10 +18,10 @@ from fishd.cli.experiment_options import (
     fish_choice,
     folder_options,
 )
-from fishd.cli.free_swim import format_speed
 from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, format_count, print_json, warn_of_fin
 from fishd.cli.progress import show_progress
+from fishd.cli.swimmer.simulation import format_speed
 from fishd.config import Config
 from fishd.controllers.base import Limits
 from fishd.core import text
@@ -59,13 +59,13 @@ def sweep_options(function: Any) -> Any:
         click.option(
             "--periods",
             type=click.IntRange(2, 10_000),
-            help="In simulation: measured tail beats of each point; for a swimmer, the "
-            "smallest number. [default: 20; for a swimmer 10]",
+            help="In simulation: measured tail beats of each point; of a free fish, the "
+            "smallest number. [default: 20; of a free fish 10]",
         ),
         click.option(
             "--settle",
             type=FiniteRange(0.0, 100_000.0),
-            help="In simulation: time before the measured beats [s]. [default: 10; for a swimmer "
+            help="In simulation: time before the measured beats [s]. [default: 10; of a free fish "
             "4, or until its speed is steady]",
         ),
         click.option(
@@ -84,7 +84,7 @@ def sweep_options(function: Any) -> Any:
 def sweep() -> None:
     """Measure thrust over a grid of parameters; write a table, recordings and a picture.
 
-    For a fish that swims freely (robot: swimmer), measure its speed.
+    The speed of a fish that swims freely is measured instead of its thrust.
 
     CONTROLLER is a controller, or several, such as square,sine,triangle. A parameter takes a
     value, a list such as 1,1.5,2, or a range such as 0.4:4:0.2 (low:high:step). All combinations

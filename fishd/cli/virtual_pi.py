@@ -2,11 +2,8 @@
 
 import contextlib
 import os
-import select
-import signal
-import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,6 +17,7 @@ from fishd.config import Config, load
 from fishd.core.addresses import virtual_pi_socket
 from fishd.core.console import complain
 from fishd.core.process import realtime
+from fishd.core.process.interruption import caught_signals
 from fishd.hardware.settings import PanelSettings
 from fishd.virtual.pi.faults import FAULTS
 from fishd.virtual.pi.link import RemotePi
@@ -71,7 +69,7 @@ def run(file: Path | None, overrides: tuple[str, ...]) -> None:
     pi = VirtualPi(settings, config.plant, config.simulation, config.tick, PunctualClock())
     if config.panel.estop_gpio is not None:
         pi.set_level(config.panel.estop_gpio, _pin_level(config.panel, pressed=False))
-    with _catch_signals() as stopped, LinkServer(pi, path):
+    with caught_signals() as stopped, LinkServer(pi, path):
         echo(
             f"virtual Pi on {path}: ADS1115 {settings.address:#04x} on I2C bus {settings.bus}, "
             f"pigpiod on 127.0.0.1:{pi.pigpiod.port} with the servo on GPIO {settings.servo_gpio}"
@@ -147,22 +145,6 @@ def press(file: Path | None, overrides: tuple[str, ...]) -> None:
 def release_button(file: Path | None, overrides: tuple[str, ...]) -> None:
     """Release the E-stop button."""
     _set_button(load(file, overrides), pressed=False)
-
-
-@contextmanager
-def _catch_signals() -> Iterator[Callable[[float], bool]]:
-    """Yield a function that waits for SIGINT or SIGTERM, up to some seconds.
-
-    It returns True once a signal has come.
-    """
-    reader, writer = socket.socketpair()
-    with reader, writer:
-        writer.setblocking(False)
-        signal.set_wakeup_fd(writer.fileno())
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: None)
-        yield lambda seconds: bool(select.select([reader], [], [], seconds)[0])
-        signal.set_wakeup_fd(-1)
 
 
 def _set_button(config: Config, pressed: bool) -> None:

@@ -122,7 +122,7 @@ def pair(scope: "Scope", url: str | None, as_json: bool, **values: Any) -> None:
 @json_option
 def devices(as_json: bool, **values: Any) -> None:
     """List the paired devices."""
-    paired = _open_devices(_load_running(**values)).list_stored()
+    paired = _open_devices(_load_running(**values)).all()
     if as_json:
         keys = ("id", "name", "scope", "paired", "seen")
         print_json([{key: getattr(device, key) for key in keys} for device in paired])

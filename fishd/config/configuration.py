@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta, Struct
@@ -22,9 +22,9 @@ from fishd.config.consistency import (
     check_neutral,
     check_pins,
     check_pulses,
+    check_robot,
     check_start,
     check_state_folder,
-    check_swimmer,
     check_virtual_pi,
 )
 from fishd.config.drivers import (
@@ -39,7 +39,7 @@ from fishd.config.drivers import (
 )
 from fishd.controllers import registry
 from fishd.controllers.base import DEFAULT_DWELL_S, MAX_DWELL_S, ChatterSettings, Controller, Limits
-from fishd.core import strict_yaml
+from fishd.core import robots, strict_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.estimation import EstimatorSettings
 from fishd.core.loop_settings import LoopSettings
@@ -133,9 +133,7 @@ class ControlSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         str | None,
         note(
             "ZeroMQ address of the ROUTER socket: ipc://PATH or tcp://127.0.0.1:PORT. null: a "
-            "socket named control in $RUNTIME_DIRECTORY, else in $XDG_RUNTIME_DIR/fishd, else in a "
-            "private folder under /tmp. From another machine, use an ssh tunnel, or the section "
-            "network."
+            "socket named control in the folder of the service or of the user."
         ),
     ] = None
     lease: Annotated[
@@ -194,13 +192,16 @@ class Config(LoopSettings, frozen=True, forbid_unknown_fields=True, kw_only=True
         Meta(description="Name of the fish, in status and telemetry; null: this machine's name."),
     ] = None
     robot: Annotated[
-        Literal["simulated", "pi", "virtual-pi", "swimmer"],
+        str,
         note(
-            "Robot: a simulated fish, the robot on this Raspberry Pi, a simulated fish behind the "
-            "robot's own drivers (fishctl virtual-pi), or a fish that swims freely in a "
-            "two-dimensional fluid."
+            "Robot: simulated, a fish on its rod; pi, the robot on this Raspberry Pi; virtual-pi, "
+            "a simulated fish behind the robot's own drivers (fishctl virtual-pi); swimmer, a fish "
+            "that swims freely in a two-dimensional fluid; or one of another package."
         ),
     ] = "simulated"
+    robot_settings: Annotated[dict[str, Any], note("Settings of a robot of another package.")] = (
+        msgspec.field(default_factory=dict)
+    )
     start: Annotated[Start, note("Controller that is started with fishd.")] = Start()
     chatter: Annotated[ChatterSettings, note("Limits for a policy that reverses too fast.")] = (
         ChatterSettings()
@@ -259,7 +260,7 @@ class Config(LoopSettings, frozen=True, forbid_unknown_fields=True, kw_only=True
     realtime: Annotated[RealtimeSettings, note("Scheduling and memory.")] = RealtimeSettings()
 
     @property
-    def kind(self) -> RobotKind:
+    def kind(self) -> type[RobotKind]:
         """Properties of the robot."""
         return find_kind(self.robot)
 
@@ -353,14 +354,15 @@ def check_tethered(robot: str, what: str) -> None:
     """Raise `ConfigError` if the fish swims freely; what: name of what needs a tethered fish."""
     if not find_kind(robot).is_tethered:
         raise ConfigError(
-            f"robot: swimmer is not valid for {what}, which needs the thrust of a tethered fish; "
-            "set robot: simulated, or use 'fishctl simulate' for a swimmer"
+            f"robot: {robot} is not valid for {what}, which needs the thrust of a tethered fish; "
+            "set robot: simulated, or use 'fishctl simulate' for one that swims freely"
         )
 
 
 Check = Callable[[Config], None]
 
 CHECKS: tuple[Check, ...] = (
+    lambda c: check_robot(c.robot, c.robot_settings),
     lambda c: check_start(c.start.controller, c.start.parameters, c.limits),
     lambda c: check_addresses(c.telemetry.address, c.control.address),
     lambda c: (
@@ -378,11 +380,7 @@ CHECKS: tuple[Check, ...] = (
     lambda c: check_lockstep(c.robot, c.lockstep),
     lambda c: check_estimator(c.robot, c.estimator.kind, c.plant),
     lambda c: check_virtual_pi(c.virtual_pi),
-    lambda c: (
-        None
-        if c.kind.is_tethered
-        else check_swimmer(c.swimmer, c.tick, c.plant.servo_law, c.estimator.kind)
-    ),
+    lambda c: c.kind.check(c),
 )
 """Checks of keys against each other, in order; each raises `Problem`."""
 
@@ -423,6 +421,7 @@ def json_schema() -> dict[str, Any]:
     types = [Config, *(struct for structs in choices.values() for struct in structs.values())]
     (top, *_), parts = msgspec.json.schema_components(types, ref_template="#/$defs/{name}")
     properties = parts["Config"]["properties"]
+    properties["robot"]["enum"] = robots.registry().names()
     for section, structs in choices.items():
         refs = []
         for struct in dict.fromkeys(structs.values()):

@@ -10,21 +10,28 @@ from typing import Any
 
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
-from fishd.core import files
+from fishd.core import files, robots
 from fishd.core.addresses import ADDRESS_FORM, Ipc, find_listen_problem, is_local, parse
-from fishd.core.errors import ParameterError, UnknownController
+from fishd.core.errors import ParameterError, UnknownController, UnknownRobot
 from fishd.core.process.unix_sockets import check_length
 from fishd.core.robots import find_kind
-from fishd.core.schema import Problem
+from fishd.core.schema import Problem, convert
 from fishd.hardware.driver import Claim
 from fishd.hardware.servo import pulses
 from fishd.hardware.settings import PanelSettings, ServoSettings
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.plant.parameters import PlantParameters
-from fishd.virtual.swimmer.settings import SwimmerSettings
 
-MAX_STEPS_PER_TICK = 200
-"""Largest number of a swimmer's steps in a tick, during which fishd answers no request."""
+
+def check_robot(name: str, settings: Mapping[str, Any]) -> None:
+    """Check that the robot is installed and accepts its settings."""
+    try:
+        kind = robots.registry().find(name)
+    except UnknownRobot as error:
+        raise Problem(
+            ("robot",), f"{error}; installed: {', '.join(robots.registry().names())}"
+        ) from None
+    convert(settings, kind.Settings, prefix=("robot_settings",))
 
 
 def check_start(controller: str | None, parameters: Mapping[str, Any], limits: Limits) -> None:
@@ -51,7 +58,8 @@ def check_addresses(telemetry: str, control: str | None) -> None:
     if control is None:
         return
     complaint = find_listen_problem(control)
-    if complaint.startswith(ADDRESS_FORM) or not (complaint or is_local(control)):
+    is_unbound = complaint is not None and complaint.startswith(ADDRESS_FORM)
+    if is_unbound or not (complaint or is_local(control)):
         complaint = (
             "ipc://PATH or tcp://127.0.0.1:PORT is needed; requests can move the fish, so they are "
             "accepted only from this machine"
@@ -179,7 +187,7 @@ def check_lockstep(robot: str, lockstep: bool) -> None:
     if lockstep and not find_kind(robot).is_real_time:
         raise Problem(
             ("lockstep",),
-            "true is not valid with robot: swimmer, whose time is always virtual and whose ticks "
+            f"true is not valid with robot: {robot}, whose time is always virtual and whose ticks "
             "wait for the agent of remote; false is needed",
         )
     if lockstep and robot != "simulated":
@@ -195,7 +203,7 @@ def check_estimator(robot: str, kind: str, plant: PlantParameters) -> None:
     if kind == "observer" and not find_kind(robot).is_tethered:
         raise Problem(
             ("estimator", "kind"),
-            "observer is not valid with robot: swimmer, since its model is of a tethered fish; "
+            f"observer is not valid with robot: {robot}, since its model is of a tethered fish; "
             "tail, sensor or lateral_force is needed",
         )
     if kind in ("sensor", "tail") and find_kind(robot).is_tethered:
@@ -209,38 +217,6 @@ def check_estimator(robot: str, kind: str, plant: PlantParameters) -> None:
             ("estimator", "kind"),
             "observer needs a model of this fish, but section plant is not set; run 'fishctl "
             "identify' to write it",
-        )
-
-
-def check_swimmer(swimmer: SwimmerSettings, tick: float, servo_law: str, estimator: str) -> None:
-    """Check that a swimmer can be computed.
-
-    tick: period of the loop [s]; servo_law: law of the servo that its muscle may follow
-    """
-    from fishd.virtual.swimmer import feasibility  # only this robot needs it
-
-    if swimmer.muscle.servo and servo_law != "tanh":
-        raise Problem(
-            ("plant", "servo_law"),
-            f"'{servo_law}' is not possible with swimmer.muscle.servo, which follows tanh",
-        )
-
-    feasibility.check(swimmer)
-    if estimator == "tail":
-        feasibility.check_tail(swimmer)
-    step = swimmer.numerics.step
-    steps = max(1, round(tick / step))
-    if abs(tick / step - steps) > 1e-6:
-        raise Problem(
-            ("tick",),
-            f"{tick:g} s is not a multiple of swimmer.numerics.step, {step:g} s; "
-            f"{steps * step:g} s would be",
-        )
-    if steps > MAX_STEPS_PER_TICK:
-        raise Problem(
-            ("swimmer", "numerics", "step"),
-            f"{step:g} s makes {steps} steps in a tick, during which fishd answers no request: at "
-            f"most {MAX_STEPS_PER_TICK} are possible",
         )
 
 

@@ -42,7 +42,7 @@ FAULTS = {
         in_a_row=3,
     ),
     "fish-lost": Fault(
-        "the computation of a swimmer has diverged, or it has left the part of the tank that is "
+        "the computation of a free fish has diverged, or it has left the part of the tank that is "
         "computed well; or a plant of another package has failed",
         "change what the message says, and start fishd again",
     ),

@@ -195,9 +195,9 @@ class ControlLoop:
         self._pending = (rest, name, controller, self._servo_calibration)
 
     @property
-    def pending(self) -> str:
-        """Name of the controller that is to start after a time at rest; empty if there is none."""
-        return self._pending[1] if self._pending else ""
+    def pending(self) -> str | None:
+        """Name of the controller that is to start after a time at rest; None if there is none."""
+        return self._pending[1] if self._pending else None
 
     def stop(self) -> None:
         """Fade to neutral and stay there; has no effect while a fault or estop is latched."""

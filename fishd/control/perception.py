@@ -131,8 +131,9 @@ class Perception:
 
     def check_usable(self, controller: Controller[Any]) -> None:
         """Raise `Refused` if F_y is reversed and the controller must not use it then."""
-        if self._is_refused(controller):
-            raise Refused("fy-reversed", self.lateral_sign.complaint)
+        complaint = self.lateral_sign.complaint
+        if complaint and self._is_refused(controller):
+            raise Refused("fy-reversed", complaint)
 
     def telemetry(self, measurement: Measurement, observation: Observation) -> dict[str, Any]:
         """Return the fields of `Tick` about forces and what follows from them.
@@ -225,10 +226,11 @@ class Perception:
             self.lateral_sign.rest()
             return
         try:
-            if self.lateral_sign.update(observation, fy) and self.lateral_sign.reversed:
-                self._reporter.event("calibration", self.lateral_sign.complaint, "warning")
+            has_changed = self.lateral_sign.update(observation, fy)
+            if has_changed and (complaint := self.lateral_sign.complaint):
+                self._reporter.event("calibration", complaint, "warning")
                 if self._is_refused(self._active.controller):
-                    self._supervisor.fail("fy-reversed", self.lateral_sign.complaint)
+                    self._supervisor.fail("fy-reversed", complaint)
         except ArithmeticError as error:
             self._reporter.problem("the check of the sign of F_y failed and was reset", error)
             self.lateral_sign.forget()

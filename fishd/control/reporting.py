@@ -21,7 +21,7 @@ class Reporter:
         """publisher: None where events have no reader; they are logged nevertheless"""
         self._clock = clock
         self._publisher = publisher
-        self._latest_problem = ""
+        self._latest_problem: str | None = None
 
     def event(self, kind: EventKind, message: str, level: Level = "info", **data: Any) -> None:
         """Publish and log an event; never raises, so that a report cannot cause another problem."""
@@ -76,7 +76,7 @@ class Reporter:
             message = f"{reason.code}: {reason.message}"
             self.event("fault", message, "error", code=reason.code, mode=mode.value)
             return
-        self._latest_problem = ""  # log a failure again if it returns after a clear
+        self._latest_problem = None  # log a failure again if it returns after a clear
         message = f"{before} → {mode}" + (f": {reason.message}" if reason else "")
         level: Level = "error" if mode is Mode.ESTOP else "info"
         self.event("mode", message, level, before=before.value, mode=mode.value)

@@ -31,20 +31,20 @@ class ServoOutput:
         self._now = now
         self._written = now()
 
-    def why_at_rest(self) -> str:
-        """Return a line if writes stopped for longer than the countdown of a driven servo; else "".
+    def why_at_rest(self) -> str | None:
+        """Return a line if writes stopped for longer than the countdown of a driven servo.
 
         The servo then is at neutral, or has no pulses any more; it must not start again by itself.
         """
-        return self.why_silent() if self.on and not self.lost else ""
+        return self.why_silent() if self.on and not self.lost else None
 
-    def why_silent(self) -> str:
-        """Return a line if the latest write began longer ago than the countdown lasts; else ""."""
+    def why_silent(self) -> str | None:
+        """Return a line if the latest write began longer ago than the countdown lasts."""
         if not self.counts_down:
-            return ""
+            return None
         silence = self._now() - self._written
         if silence <= self._countdown:
-            return ""
+            return None
         return (
             f"fishd stood still for {silence * 1e3:.0f} ms, and the servo has gone to neutral by "
             "itself, its pulses end within half a second: the machine is overloaded or was "

@@ -92,10 +92,10 @@ class Supervisor:
 
         A passed check has an effect only while there are `failures`.
 
-        problem: what failed; None or empty if the check passed
+        problem: what failed; None if the check passed
         """
         limit = FAULTS[code].in_a_row
-        if not problem:
+        if problem is None:
             self.failures.pop(code, None)
             return
         self.failures[code] = count = self.failures.get(code, 0) + 1

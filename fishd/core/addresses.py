@@ -91,23 +91,23 @@ def is_local(text: str) -> bool:
     return number is not None and number.version == 4 and number.is_loopback
 
 
-def find_listen_problem(text: str) -> str:
-    """Return why fishd cannot listen on an address; empty if it can. Port 0 means any free port."""
+def find_listen_problem(text: str) -> str | None:
+    """Return why fishd cannot listen on an address; None if it can. Port 0 means any free port."""
     try:
         address = parse(text)
     except ValueError as error:
         return str(error)
-    return ADDRESS_FORM if isinstance(address, Tcp) and address.port == "*" else ""
+    return ADDRESS_FORM if isinstance(address, Tcp) and address.port == "*" else None
 
 
-def find_connect_problem(text: str) -> str:
-    """Return why no client can connect to this address; empty if one can."""
+def find_connect_problem(text: str) -> str | None:
+    """Return why no client can connect to this address; None if one can."""
     try:
         address = parse(text)
     except ValueError as error:
         return str(error)
     if isinstance(address, Ipc):
-        return ""
+        return None
     if address.host == "*":
         return f"{ADDRESS_FORM}; * is what an agent binds, here give the host that it runs on"
     if address.port == "*" or int(address.port) == 0:
@@ -115,7 +115,7 @@ def find_connect_problem(text: str) -> str:
             f"{ADDRESS_FORM}; {address.port} is what an agent binds, here give the port that it "
             "was given"
         )
-    return ""
+    return None
 
 
 def socket_path(address: str) -> Path | None:

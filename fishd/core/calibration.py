@@ -127,8 +127,8 @@ class ForceSample(Struct, frozen=True):
     fx: float
     """Mean force by the active calibration [N]."""
     fy: float
-    suspect: str = ""
-    """Reason not to trust this sample; empty if there is none."""
+    suspect: str | None = None
+    """Reason not to trust this sample; None if there is none."""
     number: int = 0
     """Number by which a tare refers to this sample, for a limited time."""
 

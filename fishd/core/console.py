@@ -35,7 +35,7 @@ log_format_option = click.option(
 def status_line(status: "Status") -> str:
     """Return mode, controller, frequency, thrust, power, lateness and missed ticks in one line.
 
-    A swimmer has its current speed instead of a thrust. A servo that is not reached is mentioned.
+    A free fish has its current speed instead of a thrust. A servo that is not reached is mentioned.
     """
     what = status.mode if status.mode == "idle" else f"{status.mode} {status.controller}"
     if status.reason:

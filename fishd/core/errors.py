@@ -37,6 +37,10 @@ class UnknownPlant(FishdError, LookupError):
     """No installed package offers a plant of that name, or it does not load."""
 
 
+class UnknownRobot(FishdError, LookupError):
+    """No installed package offers a robot of that name, or it does not load."""
+
+
 class PolicyError(FishdError, ValueError):
     """A file does not contain a policy, or its policy does not fit this robot."""
 

@@ -24,8 +24,8 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
         note(
             "lateral_force integrates F_y and knows nothing of the fish; observer is a Kalman "
             "filter on the fish of section plant, as fishctl identify finds it; sensor takes the "
-            "angular velocity of the tail against the front body, which a swimmer measures; tail "
-            "takes the velocity of the swimmer's tail across the laboratory, as the paper does."
+            "angular velocity of the tail against the front body, which a free fish measures; tail "
+            "takes the velocity of its tail across the laboratory, as the paper's swimmer does."
         ),
     ] = "lateral_force"
     leak: Annotated[

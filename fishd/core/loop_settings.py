@@ -18,8 +18,8 @@ class LoopSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         Annotated[float, Meta(gt=0, le=10_000)] | None,
         unit(
             "rad/s",
-            "Largest rate of change of the instruction angle. null allows one full reversal, 2Φ, "
-            "in each tick, and so does not change a square wave.",
+            "Largest rate of change of the instruction angle; null: one full reversal, 2Φ, in each "
+            "tick.",
         ),
     ] = None
     fade_time: Annotated[

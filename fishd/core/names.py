@@ -9,17 +9,17 @@ NAME_TIMEOUT_S = 1.0
 """Longest wait for a name server [s]."""
 
 
-def find_name_problem(address: str) -> str:
-    """Return that the name in an address is not known; empty if it is, or may be.
+def find_name_problem(address: str) -> str | None:
+    """Return that the name in an address is not known; None if it is, or may be.
 
     Call it to explain why nothing answers there: it may wait for `NAME_TIMEOUT_S`.
     """
     try:
         where = parse(address)
     except ValueError:
-        return ""
+        return None
     if isinstance(where, Ipc):
-        return ""
+        return None
     problems: list[str] = []
 
     def look_up() -> None:
@@ -31,7 +31,7 @@ def find_name_problem(address: str) -> str:
     thread = threading.Thread(target=look_up, name="name", daemon=True)
     thread.start()
     thread.join(NAME_TIMEOUT_S)
-    return problems[0] if problems else ""
+    return problems[0] if problems else None
 
 
 def describe_name_error(host: str, error: Exception) -> str:

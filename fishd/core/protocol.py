@@ -94,9 +94,9 @@ class State(Struct, frozen=True):
         note("The experiment whose [lease](#leases) this request has ended; null if none."),
     ] = None
     cancelled: Annotated[
-        str,
-        note("The controller of `start` that `stop` has kept from starting; empty if none."),
-    ] = ""
+        str | None,
+        note("The controller of `start` that `stop` has kept from starting; null if none."),
+    ] = None
 
 
 class Grant(Struct, frozen=True):

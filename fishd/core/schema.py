@@ -329,30 +329,28 @@ def _literal_words(kind: inspect.Type) -> tuple[str, ...]:
 
 def _describe(field: inspect.Field) -> Field:
     kind, extra, optional = _unwrap(field.type)
+    name, permitted = _KINDS.get(type(kind), "text"), _permitted(kind)
     return Field(
         name=field.encode_name,
-        kind=_KINDS.get(type(kind), "text"),
+        kind=name,
         unit=extra.get("unit", ""),
         description=extra.get("description", ""),
         default=field.default if isinstance(field.default, Scalar) else None,
         optional=optional,
-        **_permitted(kind),
+        **permitted,
         required=field.required,
         file=extra.get("file", ""),
-        words=_literal_words(field.type) if isinstance(kind, inspect.FloatType) else (),
+        words=_literal_words(field.type) if name == "number" else (),
         usual=extra.get("usual", 0.0),
-        step=extra.get("step", 0.0) or _derive_step(kind, field.default),
+        step=extra.get("step", 0.0) or _derive_step(name, permitted, field.default),
     )
 
 
-def _derive_step(kind: inspect.Type, default: Any) -> float:
+def _derive_step(kind: str, permitted: Mapping[str, Any], default: Any) -> float:
     """Return a power of ten: at least 50 steps from bound to bound, or 10 from 0 to the default."""
-    if isinstance(kind, inspect.IntType):
-        return 1.0
-    if not isinstance(kind, inspect.FloatType):
-        return 0.0
-    low = kind.ge if kind.ge is not None else kind.gt
-    high = kind.le if kind.le is not None else kind.lt
+    if kind != "number":
+        return float(kind == "integer")
+    low, high = permitted["low"], permitted["high"]
     if low is not None and high is not None:
         size = (high - low) / 50.0
     else:
@@ -394,9 +392,7 @@ def _explain(
         return _unknown_key(unknown[1], path, target, elsewhere())
     if missing := re.search(r"missing required field `(.*)`", complaint):
         path = (*path, missing[1])
-        return Problem(
-            path, f"is missing: {describe_permitted(_describe(_field_at(target, path)))} is needed"
-        )
+        return Problem(path, f"is missing: {describe_permitted(_field_at(target, path))} is needed")
     value = data
     for key in keys:
         if isinstance(value, Mapping):
@@ -408,12 +404,11 @@ def _explain(
             path, f"{format_excerpt(value)} is not valid: a mapping of keys to values is needed"
         )
     field = _field_at(target, path)
+    hint = _ask_for_other_unit(value, field) or _ask_for_hexadecimal(value, field)
     return Problem(
         path,
-        f"{format_excerpt(value)} is not valid: {describe_permitted(_describe(field))} is needed"
-        + _ask_for_other_unit(value, field)
-        + _ask_for_hexadecimal(value, field)
-        + _entry_hint(value, field),
+        f"{format_excerpt(value)} is not valid: {describe_permitted(field)} is needed"
+        + (hint or _entry_hint(value, field)),
     )
 
 
@@ -432,35 +427,28 @@ def _unknown_key(
     return UnknownKey((*path, key), f"unknown key; {hint}")
 
 
-def _ask_for_hexadecimal(value: Any, field: inspect.Field) -> str:
+def _ask_for_hexadecimal(value: Any, field: Field) -> str:
     """Return a hint if the digits of an I2C address are valid as hexadecimal ones, or empty."""
-    kind, _, _ = _unwrap(field.type)
-    if "address" not in field.encode_name or not isinstance(kind, inspect.IntType):
+    if "address" not in field.name or field.kind != "integer":
         return ""
     try:
         address = int(str(value), 16)
     except ValueError:
         return ""
-    valid = kind.ge is not None and kind.le is not None and kind.ge <= address <= kind.le
-    return f"; {address:#04x} may be meant" if valid else ""
+    return f"; {address:#04x} may be meant" if _is_within(address, field) else ""
 
 
-def _ask_for_other_unit(value: Any, field: inspect.Field) -> str:
+def _ask_for_other_unit(value: Any, field: Field) -> str:
     """Return a question if a value is valid only in another common unit.
 
     An angle may be in degrees, other values in thousandths: ` (mN? that is 0.02 N)`.
     """
-    kind, extra, _ = _unwrap(field.type)
-    if not isinstance(kind, inspect.FloatType) or not _is_number(value):
+    _, factor = _OTHER_UNITS.get(field.unit, ("", 0.0))
+    if field.kind != "number" or not factor or not _is_number(value):
         return ""
-    symbol = extra.get("unit", "")
-    name, factor = _OTHER_UNITS.get(symbol, ("", 0.0))
-    if not name or not abs(value) <= (360 if symbol == "rad" else _MAX_IN_OTHER_UNIT):
-        return ""
-    converted = factor * value
-    above = converted >= kind.ge if kind.ge is not None else kind.gt is None or converted > kind.gt
-    below = converted <= kind.le if kind.le is not None else kind.lt is None or converted < kind.lt
-    return f" ({ask_for_unit(value, symbol)})" if above and below else ""
+    is_plausible = abs(value) <= (360 if field.unit == "rad" else _MAX_IN_OTHER_UNIT)
+    is_meant = is_plausible and _is_within(factor * value, field)
+    return f" ({ask_for_unit(value, field.unit)})" if is_meant else ""
 
 
 def ask_for_unit(value: float, symbol: str) -> str:
@@ -531,8 +519,11 @@ _BOOLEANS = {"true": True, "yes": True, "on": True, "false": False, "no": False,
 def is_valid_number(values: Mapping[str, Any], field: Field) -> bool:
     """Return whether the value of this field is a number within its interval."""
     value = values.get(field.name)
-    if not _is_number(value):
-        return False
+    return _is_number(value) and _is_within(value, field)
+
+
+def _is_within(value: float, field: Field) -> bool:
+    """Return whether a number is within the interval of a field."""
     low, high = field.low, field.high
     above = low is None or value > low or (value == low and not field.low_open)
     below = high is None or value < high or (value == high and not field.high_open)
@@ -556,7 +547,7 @@ def format_values(values: Mapping[str, Any], units: Mapping[str, str], separator
 def unit_at(target: type[Struct], key: str) -> str:
     """Return the unit of a key of a struct and its sections, in dotted form; empty if unknown."""
     try:
-        return _describe(_field_at(target, tuple(key.split(".")))).unit
+        return _field_at(target, tuple(key.split("."))).unit
     except StopIteration:
         return ""
 
@@ -570,28 +561,20 @@ def _is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _entry_hint(value: Any, field: inspect.Field) -> str:
+def _entry_hint(value: Any, field: Field) -> str:
     """Return a hint to write a single value as a list, or the wrong word of a list."""
-    kind, _, _ = _unwrap(field.type)
-    if not isinstance(kind, inspect.VarTupleType):
+    if field.kind != "list":
         return ""
-    item = kind.item_type
-    words = item.values if isinstance(item, inspect.LiteralType) else ()
     if not isinstance(value, list):
-        fits = value in words or (
-            isinstance(item, inspect.IntType)
-            and type(value) is int
-            and (item.ge is None or value >= item.ge)
-            and (item.le is None or value <= item.le)
-        )
-        return f": write [{value}]" if fits else ""
-    wrong = [format_excerpt(entry) for entry in value if words and entry not in words]
-    return f"; {wrong[0]} is none of them" if wrong else ""
+        is_number = field.items == "integer" and type(value) is int and _is_within(value, field)
+        return f": write [{value}]" if is_number or value in field.choices else ""
+    wrong = [format_excerpt(entry) for entry in value if entry not in field.choices]
+    return f"; {wrong[0]} is none of them" if wrong and field.choices else ""
 
 
-def _field_at(target: type[Struct], path: tuple[str, ...]) -> inspect.Field:
-    fields = _info(_struct_at(target, path[:-1])).fields
-    return next(field for field in fields if field.encode_name == path[-1])
+def _field_at(target: type[Struct], path: tuple[str, ...]) -> Field:
+    fields = fields_of(_struct_at(target, path[:-1]))
+    return next(field for field in fields if field.name == path[-1])
 
 
 def _struct_at(target: type[Struct], path: tuple[str, ...]) -> type[Struct]:

@@ -34,8 +34,8 @@ class Measurement(Struct, frozen=True, gc=False):
     """Mean lateral force of the window [N]."""
     samples: int
     """Number of sample pairs in the means."""
-    suspect: str = ""
-    """Reason not to trust these forces, such as a clipped sample; empty if there is none."""
+    suspect: str | None = None
+    """Reason not to trust these forces, such as a clipped sample; None if there is none."""
     extremes: Extremes | None = None
     """Extremes of the samples in the means, if the sensor provides them."""
     fin_velocity: float | None = None
@@ -86,7 +86,7 @@ class Observation(Struct, frozen=True, gc=False):
 
 
 class Course(Struct, frozen=True, gc=False):
-    """Position and motion of a free swimmer; the x axis points against its initial direction."""
+    """Position and motion of a free fish; the x axis points against its initial direction."""
 
     x: float
     """[m]"""
@@ -106,9 +106,9 @@ class Truth(Struct, frozen=True, gc=False):
     alpha_rate: float
     """Fin angular velocity [rad/s]."""
     phi: float
-    """Servo wheel angle [rad]; for a swimmer, Φ times the activation of its muscles."""
+    """Servo wheel angle [rad]; for a free fish, Φ times the activation of its muscles."""
     course: Course | None = None
-    """Course of a free swimmer; None for a tethered fish."""
+    """Course of a free fish; None for a tethered fish."""
 
 
 class Tick(Struct, frozen=True, gc=False):
@@ -184,13 +184,13 @@ class Tick(Struct, frozen=True, gc=False):
         float,
         unit(
             "s",
-            "Time of the tick, on fishd's monotonic clock; virtual in lockstep and with a swimmer, "
+            "Time of the tick, on fishd's monotonic clock; virtual in lockstep and of a free fish, "
             "for which a second takes several seconds of `t`.",
         ),
     ] = 0.0
     x: Annotated[
         float | UnsetType,
-        unit("m", "Position; only of a swimmer, like the next three. It swims towards −x."),
+        unit("m", "Position; only of a free fish, like the next three. It swims towards −x."),
     ] = UNSET
     y: Annotated[float | UnsetType, unit("m", "Position across the direction of swimming.")] = UNSET
     speed: Annotated[float | UnsetType, unit("m/s", "True speed, along −x.")] = UNSET
@@ -466,7 +466,7 @@ class Status(Struct, frozen=True):
     missed_slots: Annotated[int, note("Number of slots skipped since start.")]
     overruns: Annotated[int, note("Number of ticks that took longer than a period, since start.")]
     timing: Annotated[Timing, note("Timing of the loop since start.")]
-    robot: Annotated[str, note("Kind of robot: `simulated`, `pi`, `virtual-pi` or `swimmer`.")]
+    robot: Annotated[str, note("The robot, as `robot` in the configuration.")]
     limitations: Annotated[tuple[str, ...], note("Limitations of this robot.")]
     recovered_errors: Annotated[
         dict[str, int], note("Number of errors that fishd recovered from since start, by name.")

@@ -24,11 +24,11 @@ os._exit(0)
 """
 
 
-_verdicts: dict[str, str] = {}
+_verdicts: dict[str, str | None] = {}
 
 
-def find_danger(module: str, timeout: float | None = None) -> str:
-    """Return what the import of a module does to its process; empty if it survives.
+def find_danger(module: str, timeout: float | None = None) -> str | None:
+    """Return what the import of a module does to its process; None if it survives.
 
     An import that raises an exception is no danger. The result is kept, unless the import did not
     end in time: that may be the fault of a busy machine.
@@ -45,7 +45,7 @@ def find_danger(module: str, timeout: float | None = None) -> str:
     return _verdicts[module]
 
 
-def _try(module: str, timeout: float) -> str:
+def _try(module: str, timeout: float) -> str | None:
     reader, writer = os.pipe()
     command = python_command("-B", "-c", _CHILD, str(writer), module)
     quiet = subprocess.DEVNULL
@@ -68,7 +68,7 @@ def _try(module: str, timeout: float) -> str:
             survived = False
         os.close(reader)
     if survived:
-        return ""
+        return None
     if status == _CLOSED:
         return "its import closes files of its process"
     if status < 0:

@@ -11,8 +11,8 @@ _MAX_LINKS = 40
 """Number of symbolic links on one way, as in the kernel."""
 
 
-def find_folder_problem(folder: Path, *trusted: int) -> str:
-    """Return why other users may change a folder, and what mends it; empty if none may.
+def find_folder_problem(folder: Path, *trusted: int) -> str | None:
+    """Return why other users may change a folder, and what mends it; None if none may.
 
     Neither the folder nor one on the way to it may belong to another user than this one, root or
     the `trusted` ones, or be writable for others. On the way, a folder such as /tmp may be
@@ -35,7 +35,7 @@ def find_folder_problem(folder: Path, *trusted: int) -> str:
                     f"{place}: other users may change {what} (mode {stat.S_IMODE(mode):o}); run "
                     f"'chmod go-w {place}'"
                 )
-    return ""
+    return None
 
 
 def _list_way(path: Path) -> Iterator[tuple[Path, os.stat_result]]:

@@ -63,7 +63,7 @@ class Daemon:
         self._print_status = print_status
         self._slow: SlowMotion | None = None
         if not config.kind.is_real_time:
-            self._slow = SlowMotion(config.tick, config.swimmer.slow_motion)
+            self._slow = SlowMotion(config.tick, config.kind.slow_motion(config))
         self._clock = SlowClock() if self._slow else _clock(config)
         self._virtual = isinstance(self._clock, VirtualClock)
         self._events = asyncio.get_running_loop()

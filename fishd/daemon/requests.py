@@ -329,7 +329,9 @@ class Operations:
         self._arrivals += 1
         return self._arrivals
 
-    def _state(self, previous_holder: LeaseHolder | None = None, cancelled: str = "") -> State:
+    def _state(
+        self, previous_holder: LeaseHolder | None = None, cancelled: str | None = None
+    ) -> State:
         loop = self._loop
         return State(
             seq=loop.seq + 1,

@@ -83,7 +83,7 @@ class SlowMotion:
         """Return the line about slow motion for the status."""
         line = f"slow motion: a second of the fish takes {self.pace:.3g} s"
         if self.pace > MAX_PACE_RATIO * self._factor:
-            line += f", since this machine is too slow for swimmer.slow_motion: {self._factor:g}"
+            line += f", since this machine is too slow for the configured {self._factor:g} s"
         return line
 
 

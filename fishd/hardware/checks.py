@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from fishd.core.robots import ROBOTS
+from fishd.core.robots import RobotKind
 
 START_VIRTUAL_PI = "fishctl virtual-pi run"
 """Remedy if no virtual Pi is running."""
@@ -69,13 +69,18 @@ class Machine(ABC):
         return nullcontext()
 
 
+def on_this_machine(kind: type[RobotKind]) -> bool:
+    """Return whether the hardware of a robot is wired to this machine."""
+    return kind.has_hardware and not kind.is_virtual
+
+
 class Check(NamedTuple):
     """Function of the machine, with its name; it returns None if there is nothing to check."""
 
     name: str
     function: Callable[[Any], Result | None]
-    robots: tuple[str, ...] = tuple(ROBOTS)
-    """Names of the robots that it applies to."""
+    applies: Callable[[type[RobotKind]], bool] = lambda kind: True
+    """Function that returns whether the check is for this robot."""
 
 
 def ok(message: str) -> Result:

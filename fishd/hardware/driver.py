@@ -113,8 +113,8 @@ class Pair(NamedTuple):
     vx: float
     """Value in proportion to F_x: a voltage [V], or in the unit that `raw_unit` names."""
     vy: float
-    clipped: str = ""
-    """Reason not to trust the two, such as an end of the range; empty if they can be trusted."""
+    clipped: str | None = None
+    """Reason not to trust the two, such as an end of the range; None if they can be trusted."""
 
 
 class SampledDriver(Driver[T]):

@@ -13,7 +13,17 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from fishd.hardware.checks import Check, Machine, Result, fail, ok, skipped, user_name, warning
+from fishd.hardware.checks import (
+    Check,
+    Machine,
+    Result,
+    fail,
+    ok,
+    on_this_machine,
+    skipped,
+    user_name,
+    warning,
+)
 from fishd.hardware.driver import Claim
 
 log = logging.getLogger(__name__)
@@ -125,8 +135,8 @@ def explain(error: Exception, bus: int, address: int, chip: str, section: str) -
 def checks(bus: int, section: str) -> tuple[Check, ...]:
     """Return the checks of the bus that `section`.bus names."""
     return (
-        Check("i2c bus", lambda machine: _bus(machine, bus, section), ("pi",)),
-        Check("i2c speed", lambda machine: _speed(machine, bus), ("pi",)),
+        Check("i2c bus", lambda machine: _bus(machine, bus, section), on_this_machine),
+        Check("i2c speed", lambda machine: _speed(machine, bus), on_this_machine),
     )
 
 

@@ -57,12 +57,12 @@ def claim_parts(parts: Iterable[Part]) -> Iterator[None]:
         yield
 
 
-def describe_owner(parts: Iterable[Part]) -> str:
-    """Return a line that names the fishd that drives one of these parts; empty if none does."""
+def describe_owner(parts: Iterable[Part]) -> str | None:
+    """Return a line that names the fishd that drives one of these parts; None if none does."""
     for part in parts:
         if holder := find_holder(part.name):
             return f"a fishd (pid {holder}) drives {part.what}"
-    return ""
+    return None
 
 
 def find_owner(parts: Iterable[Part]) -> Holder | None:

@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable
 
 from fishd.core.clock import Clock
-from fishd.hardware.panel_pins import ChipPins, RpiGpioPins, find_pins
+from fishd.hardware.panel_pins import PanelPins
 from fishd.hardware.settings import PanelSettings
 
 log = logging.getLogger(__name__)
@@ -33,9 +33,9 @@ class Panel:
         self._changed = 0.0
         self._dark = settings.led_gpio is None
         self._closed = False
-        self._pins: ChipPins | RpiGpioPins | None = None
+        self._pins: PanelPins | None = None
         if settings.has_pins:
-            self._pins = find_pins()(settings.estop_gpio, settings.led_gpio)
+            self._pins = PanelPins(settings.estop_gpio, settings.led_gpio)
             if settings.estop_gpio is not None:
                 clock.sleep(0.001)  # the pull-up has to charge the wire first
                 self._pins.listen(self._on_edge)

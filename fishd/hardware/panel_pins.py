@@ -1,7 +1,4 @@
-"""Pins of the operator's panel: through the kernel's GPIO chip, or through RPi.GPIO.
-
-gpiod is libgpiod's own package. Where it is not installed, RPi.GPIO or rpi-lgpio does the same.
-"""
+"""Pins of the operator's panel, through libgpiod's own package gpiod."""
 
 import logging
 import os
@@ -11,7 +8,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from fishd.core.errors import MissingPackage, StartupError
-from fishd.hardware import header
 
 if TYPE_CHECKING:
     from gpiod import LineRequest, LineSettings
@@ -31,22 +27,17 @@ CONSUMER = "fishd"
 """Name that the kernel shows as the user of the pins."""
 
 
-def find_pins() -> "type[ChipPins | RpiGpioPins]":
-    """Return the kind of pins whose package is installed; raise `MissingPackage` if none is."""
+def find_chip() -> str:
+    """Return the path of the header's GPIO chip.
+
+    Raises `MissingPackage` without gpiod, and `StartupError` if the chip cannot be used.
+    """
     try:
-        import gpiod.line_settings  # noqa: F401  # versions 1.x, with another API, do not have it
+        import gpiod.line_settings  # versions 1.x, with another API, do not have it
     except ImportError:
-        if header.installed_packages():
-            return RpiGpioPins
         raise MissingPackage(
             "E-stop button and status light need the package gpiod, 2.3 or later; install fishd[pi]"
         ) from None
-    return ChipPins
-
-
-def find_chip() -> str:
-    """Return the path of the header's GPIO chip; raise `StartupError` if it cannot be used."""
-    import gpiod
 
     others, denied = [], ""
     for path in (f"/dev/gpiochip{number}" for number in range(MAX_CHIPS)):
@@ -75,14 +66,15 @@ def find_chip() -> str:
     )
 
 
-class ChipPins:
+class PanelPins:
     """Pin of a button, a contact to ground with a pull-up, and pin of a light, through gpiod.
 
     One of them may be absent.
     """
 
     def __init__(self, button: int | None, light: int | None) -> None:
-        """Claim the pins; raise `StartupError` if that is not possible."""
+        """Claim the pins; raises `StartupError`, and the errors of `find_chip`."""
+        chip = find_chip()
         from gpiod.line import Bias, Direction, Edge, Value
         from gpiod.line_settings import LineSettings
 
@@ -100,7 +92,7 @@ class ChipPins:
             )
         if light is not None:
             lines[light] = LineSettings(direction=Direction.OUTPUT)
-        self._request = _claim(find_chip(), lines)
+        self._request = _claim(chip, lines)
 
     def listen(self, on_edge: Callable[[], None]) -> None:
         """Call a function, from another thread, after each edge of the button."""
@@ -170,63 +162,3 @@ def _claim(path: str, lines: "dict[Any, LineSettings | None]") -> "LineRequest":
         + ", ".join(f"GPIO {pin} is held by {user}" for pin, user in users)
         + "; stop that program, remove its dtoverlay, or choose another pin"
     )
-
-
-class RpiGpioPins:
-    """The same pins through RPi.GPIO or rpi-lgpio."""
-
-    def __init__(self, button: int | None, light: int | None) -> None:
-        """Claim the pins; raise `StartupError` if that is not possible."""
-        self._button, self._light = button, light
-        self._gpio = gpio = header.load()
-        pin = 0
-        try:
-            for pin in self._pins():
-                if pin == light:
-                    header.claim(gpio, pin, gpio.OUT, initial=gpio.LOW)
-                else:
-                    header.claim(gpio, pin, gpio.IN, pull_up_down=gpio.PUD_UP)
-        except Exception as error:  # lgpio.error is a bare Exception
-            raise StartupError(
-                f"GPIO {pin} cannot be used for the panel: {header.format_error(error)}"
-            ) from None
-
-    def listen(self, on_edge: Callable[[], None]) -> None:
-        """Ask the library to report edges at once; if it cannot, only ticks poll the button."""
-        gpio = self._gpio
-        try:
-            gpio.add_event_detect(self._button, gpio.BOTH, lambda _: on_edge(), BOUNCE_MS)
-        except Exception as error:
-            # RPi.GPIO cannot do it on Linux 6.6 and later.
-            log.warning(
-                "E-stop button on GPIO %d is polled only, once a tick: %s; "
-                "the package gpiod would report it at once",
-                self._button,
-                header.format_error(error),
-            )
-
-    def is_high(self) -> bool:
-        """Return the level of the button; raise OSError if it cannot be read."""
-        return bool(self._call(self._gpio.input, self._button))
-
-    def switch(self, lit: bool) -> None:
-        """Switch the light; raise OSError if that fails."""
-        self._call(self._gpio.output, self._light, int(lit))
-
-    def close(self) -> None:
-        """Release the pins, and stop reporting edges."""
-        for pin in self._pins():  # cleanup() without a pin takes those of everybody
-            try:
-                self._gpio.cleanup(pin)
-            except Exception as error:
-                log.warning("cannot give back GPIO %d: %s", pin, header.format_error(error))
-
-    def _pins(self) -> list[int]:
-        return [pin for pin in (self._button, self._light) if pin is not None]
-
-    @staticmethod
-    def _call(function: Callable[..., object], *arguments: object) -> object:
-        try:
-            return function(*arguments)
-        except Exception as error:  # lgpio.error is a bare Exception
-            raise OSError(header.format_error(error)) from None

@@ -34,8 +34,8 @@ class Sampler(Generic[X]):
         self._clock = clock
         self.samples: deque[X] = deque(maxlen=MAX_SAMPLES)
         """Samples received, for another thread to take with `popleft`."""
-        self.trouble = ""
-        """Reason why the latest attempt failed, one line; empty if it did not. For any thread."""
+        self.trouble: str | None = None
+        """Reason why the latest attempt failed, one line; None if it did not. For any thread."""
         self.errors = 0
         """Number of failed attempts since start. For any thread."""
         self.reconnects = 0
@@ -62,7 +62,7 @@ class Sampler(Generic[X]):
                 self.samples.append(sample)
                 self.reconnects += self._failures >= REOPEN_FAILURES
                 self._failures = 0
-                self.trouble = ""
+                self.trouble = None
 
     def close(self) -> None:
         """Release the hardware; never raises, may be called twice."""

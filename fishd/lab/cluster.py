@@ -1,9 +1,4 @@
-"""The workers of a Dask cluster, in place of processes on this machine.
-
-The connection has an event loop in a separate thread. So each wait has a limit, also for a program
-that accepts the connection and is silent, for which Dask has none; and signals are handled
-meanwhile.
-"""
+"""The workers of a Dask cluster, in place of processes on this machine."""
 
 import asyncio
 import logging
@@ -11,10 +6,10 @@ import platform
 import threading
 import time
 import warnings
-from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any, NamedTuple, TypeVar
 from uuid import uuid4
 
@@ -46,9 +41,6 @@ _ENDED = "its scheduler has ended, or cannot be reached"
 _REMEDY = "give the address from the scheduler's log, such as tcp://HOST:8786"
 _SILENT = f"what listens there is silent, like a dashboard or another program; {_REMEDY}"
 
-_Outcomes = SimpleQueue[tuple[int, Any] | BaseException | None]
-"""Index and result of each task; an error that ends the computation; None after a signal."""
-
 
 class EventStop(NamedTuple):
     """An event of the scheduler that means stop."""
@@ -73,23 +65,19 @@ class EventStop(NamedTuple):
 class Cluster:
     """The workers of a Dask cluster; see `connect`."""
 
-    def __init__(self, address: str, stop_timeout: float) -> None:
-        """See `connect`, which also opens the connection."""
+    def __init__(self, client: Any, address: str, stop_timeout: float) -> None:
+        """client: connected to the scheduler at `address`"""
         self.stop = EventStop(f"fishd-stop-{uuid4().hex}")
-        self._address = address
+        self._client, self._address = client, address
         self._stop_timeout = stop_timeout
-        self._client: Any = None
         self._stop_deadline: float | None = None
-        self._closing = asyncio.Event()
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._run_loop, daemon=True)
-        self._thread.start()
 
     def ask_to_stop(self) -> None:
         """Tell all tasks to stop, also those that have not started; returns immediately."""
         if self._stop_deadline is None:
             self._stop_deadline = time.monotonic() + self._stop_timeout
-            self._start(self._set_stop())
+            event = distributed.Event(self.stop.name, client=self._client)
+            self._client.loop.add_callback(event.set)
 
     def run(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[tuple[int, R]]:
         """Yield index and result of each task, in the order in which they end.
@@ -100,126 +88,92 @@ class Cluster:
         the tasks that have not ended in time. Raises `Unfinished` where the cluster is lost or a
         task raises an exception.
         """
-        unfinished = set(range(len(tasks)))
-        outcomes: _Outcomes = SimpleQueue()
-        computation = self._start(self._compute(function, tasks, outcomes))
+        versions = read_versions()
+        left: dict[Any, int] = {}
         try:
-            while unfinished:
-                outcome = outcomes.get()
-                if outcome is None:
+            for index, task in enumerate(tasks):
+                left[self._client.submit(_run_checked, versions, function, task, pure=False)] = (
+                    index
+                )
+            last_worker = time.monotonic()
+            while left:
+                with suppress(TimeoutError):
+                    distributed.wait(list(left), _WATCH_INTERVAL_S, "FIRST_COMPLETED")
+                for future in [future for future in left if future.done()]:
+                    result = future.result()
+                    yield left.pop(future), result
+                now, has_workers = time.monotonic(), self._has_workers()
+                last_worker = now if has_workers else last_worker
+                if self._stop_deadline and (not has_workers or now > self._stop_deadline):
                     return
-                if isinstance(outcome, BaseException):
-                    message = f"the Dask cluster at {self._address}: {_describe(outcome)}"
-                    raise Unfinished(message, sorted(unfinished)) from None
-                unfinished.remove(outcome[0])
-                yield outcome
-        finally:
-            computation.cancel()
+                if now > last_worker + NO_WORKER_TIMEOUT_S:
+                    raise _Lost("no worker is left")
+        except (Exception, asyncio.CancelledError) as error:
+            message = f"the Dask cluster at {self._address}: {_describe(error)}"
+            raise Unfinished(message, sorted(left.values())) from None
 
-    def open(self) -> None:
-        """Connect, and compare versions; raises `Unfinished`."""
-        self._start(self._connect()).result()
+    def _has_workers(self) -> bool:
+        """Return whether the scheduler has a worker; raises OSError where it does not answer."""
+        count = self._client.scheduler.ncores
+        return bool(self._client.sync(count, callback_timeout=_ANSWER_TIMEOUT_S))
 
-    def close(self) -> None:
-        """Close the connection, with a time limit."""
-        self._loop.call_soon_threadsafe(self._closing.set)
-        self._thread.join(2.0 * _CLOSE_TIMEOUT_S)
 
-    def _run_loop(self) -> None:
-        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
-            runner.run(self._keep_open())
+def _open_client(address: str) -> Any:
+    """Return a client of a scheduler whose workers have the versions of this machine.
 
-    async def _keep_open(self) -> None:
-        await self._closing.wait()
-        with suppress(Exception):
-            await asyncio.wait_for(self._client.close(), _CLOSE_TIMEOUT_S)
+    It connects in a separate thread, because Dask waits without a limit for a program that accepts
+    the connection and is silent.
+    """
+    nothing = f"no Dask scheduler answers at {address}"
+    place = "scheduler_file" if address.endswith(".json") else "address"
+    cause = f"{nothing}: {_SILENT}"
+    if place == "scheduler_file" and not Path(address).exists():
+        cause = f"{nothing}: there is no such file"
+    clients: list[Any] = []
+    outcomes: list[Any] = []
 
-    def _start(self, coroutine: Coroutine[Any, Any, Any]) -> Any:
-        """Start a coroutine in the thread of the connection; return its concurrent future."""
-        return asyncio.run_coroutine_threadsafe(coroutine, self._loop)
-
-    async def _connect(self) -> None:
-        place = "scheduler_file" if self._address.endswith(".json") else "address"
-        nothing = f"no Dask scheduler answers at {self._address}"
-        cause = f"{nothing}: {_SILENT}"
+    def open_client() -> None:
+        nonlocal cause
         try:
-            async with asyncio.timeout(CONNECT_TIMEOUT_S):
-                self._client = distributed.Client(
-                    **{place: self._address},
-                    asynchronous=True,
-                    set_as_default=False,
+            clients.append(
+                distributed.Client(
+                    **{place: address},
                     timeout=0.8 * CONNECT_TIMEOUT_S,
                     name="fishctl",
                 )
-                await self._client
-                cause = f"the Dask scheduler at {self._address} has no workers; start some"
-                while not await self._client.nthreads():
-                    await asyncio.sleep(0.1)
-                cause = f"the workers of the Dask cluster at {self._address} do not answer"
-                answers = await self._client.run(read_versions, on_error="return")
-                answers["its scheduler"] = await self._read_scheduler_versions()
-        except TimeoutError:
-            if place == "scheduler_file" and not Path(self._address).exists():
-                cause = f"{nothing}: there is no such file"
-            raise Unfinished(cause) from None
-        except OSError:
-            raise Unfinished(f"{nothing}: cannot connect; {_REMEDY}") from None
-        except ValueError as error:
-            raise Unfinished(f"{nothing}: {error}; {_REMEDY}") from None
-        except Exception:
-            raise Unfinished(f"{nothing}: another program listens there; {_REMEDY}") from None
-        _check_versions(answers)
-
-    async def _read_scheduler_versions(self) -> dict[str, str] | ImportError:
-        """Return the versions of the scheduler, which reads each task before a worker does."""
-        try:
-            versions: dict[str, str] = await self._client.run_on_scheduler(read_versions)
-        except ImportError as error:
-            return error
-        return versions
-
-    async def _set_stop(self) -> None:
-        await distributed.Event(self.stop.name, client=self._client).set()
-
-    async def _compute(
-        self, function: Callable[[T], R], tasks: Sequence[T], outcomes: _Outcomes
-    ) -> None:
-        versions = read_versions()
-
-        async def compute(index: int, task: T) -> None:
-            future = self._client.submit(_run_checked, versions, function, task, pure=False)
+            )
+            cause = f"the Dask scheduler at {address} has no workers; start some"
+            clients[0].wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
+            cause = f"the workers of the Dask cluster at {address} do not answer"
+            answers = clients[0].run(read_versions, on_error="return")
+            # The scheduler reads each task before a worker does.
             try:
-                result = await future
-            except (Exception, asyncio.CancelledError):
-                if future.cancelled():
-                    raise _Lost(_ENDED) from None
-                raise
-            outcomes.put((index, result))
+                answers["its scheduler"] = clients[0].run_on_scheduler(read_versions)
+            except ImportError as error:
+                answers["its scheduler"] = error
+            outcomes.append(answers)
+        except Exception as error:
+            outcomes.append(error)
 
-        try:
-            async with asyncio.TaskGroup() as group:
-                group.create_task(self._watch(outcomes))
-                for index, task in enumerate(tasks):
-                    group.create_task(compute(index, task))
-        except BaseExceptionGroup as errors:
-            outcomes.put(errors.exceptions[0])
-
-    async def _watch(self, outcomes: _Outcomes) -> None:
-        """Raise `_Lost` when the cluster is lost; end the computation when it is time to stop."""
-        last_worker = time.monotonic()
-        while True:
-            await asyncio.sleep(_WATCH_INTERVAL_S)
-            try:
-                workers = await asyncio.wait_for(self._client.nthreads(), _ANSWER_TIMEOUT_S)
-            except OSError:
-                raise _Lost(_ENDED) from None
-            now = time.monotonic()
-            if workers:
-                last_worker = now
-            elif now > last_worker + NO_WORKER_TIMEOUT_S:
-                raise _Lost("no worker is left")
-            if self._stop_deadline and (not workers or now > self._stop_deadline):
-                outcomes.put(None)
+    thread = threading.Thread(target=open_client, daemon=True)
+    thread.start()
+    thread.join(CONNECT_TIMEOUT_S)
+    outcome = outcomes[0] if outcomes else TimeoutError()
+    try:
+        if isinstance(outcome, TimeoutError):
+            raise Unfinished(cause)
+        if isinstance(outcome, OSError):
+            raise Unfinished(f"{nothing}: cannot connect; {_REMEDY}")
+        if isinstance(outcome, ValueError):
+            raise Unfinished(f"{nothing}: {outcome}; {_REMEDY}")
+        if isinstance(outcome, Exception):
+            raise Unfinished(f"{nothing}: another program listens there; {_REMEDY}")
+        _check_versions(outcome)
+    except Unfinished:
+        for client in clients:
+            _close(client)
+        raise
+    return clients[0]
 
 
 class _Lost(FishdError):
@@ -237,12 +191,16 @@ def connect(address: str, stop_timeout: float) -> Iterator[Cluster]:
     other versions than this machine.
     """
     with _quiet():
-        cluster = Cluster(address, stop_timeout)
+        client = _open_client(address)
         try:
-            cluster.open()
-            yield cluster
+            yield Cluster(client, address, stop_timeout)
         finally:
-            cluster.close()
+            _close(client)
+
+
+def _close(client: Any) -> None:
+    with suppress(Exception):  # the scheduler may have ended
+        client.close(_CLOSE_TIMEOUT_S)
 
 
 def read_versions() -> dict[str, str]:
@@ -255,6 +213,8 @@ def _describe(error: BaseException) -> str:
     """Return the message for an error that ends a computation."""
     if isinstance(error, _Lost):
         return str(error)
+    if isinstance(error, OSError | asyncio.CancelledError | CancelledError):
+        return _ENDED
     if isinstance(error, KilledWorker):
         return (
             f"{error.allowed_failures + 1} workers ended during the same task, most likely because "

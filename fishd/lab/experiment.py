@@ -24,7 +24,6 @@ from fishd.core.process.lockfile import LockHeld, NotALock, find_lock_holder, lo
 from fishd.lab import tables
 from fishd.lab.tables import Table
 from fishd.recording.folder import runs_folder
-from fishd.recording.numbering import next_number
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX
 
 HEADER, ROWS, RESULT = "experiment.json", "rows.csv", "result.json"
@@ -233,7 +232,7 @@ def _with_start(path: Path, header: Header) -> Header:
     """Return the header of an experiment that begins now: with its time and running number."""
     root = path.absolute().parent
     known = (entry.number for _, entry in list_experiments(root) if isinstance(entry, Header))
-    return msgspec.structs.replace(header, began=_now(), number=next_number(root, known))
+    return msgspec.structs.replace(header, began=_now(), number=max(known, default=0) + 1)
 
 
 def _now() -> str:

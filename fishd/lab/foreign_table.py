@@ -40,24 +40,12 @@ CONTROLLER = "imported"
 """Name of the controller in ticks of another rig."""
 MAX_TABLE_BYTES = 256 * 2**20
 """Largest size of a file [bytes]: 100 columns of an hour at 50 Hz."""
-MAX_LINE_CHARACTERS = 2**17
-"""Longest line: 5000 columns [characters]."""
 MAX_PERIOD_S = 1.0
 """Longest time between most rows without a stated rate; a longer one is a mistake [s]."""
 MAX_RATE_ERROR = 0.2
 """Largest relative difference between a stated rate and the times."""
 _MAX_ROUNDING = 1.2
 """Largest range of the errors of even times, in units of the last digit: 1, and the fit's error."""
-_SAVE = "save the table as CSV (UTF-8)"
-_OTHER_FORMATS = {
-    b"\x89MCAP": "it is a recording, not a table: fishctl export writes its table",
-    b"PK\3\4": f"it is an Excel workbook or another ZIP archive: {_SAVE}",
-    b"\xd0\xcf\x11\xe0": f"it is an Excel workbook: {_SAVE}",
-    b"\x1f\x8b": "it is compressed (gzip): unpack it first",
-    b"%PDF": f"it is a PDF document: {_SAVE}",
-    **dict.fromkeys((b"<!", b"<?", b"<html", b"<table"), f"it is HTML or XML: {_SAVE}"),
-}
-"""Formats that are not tables of text, by their first bytes, with the remedy."""
 _BINARY = re.compile(rb"[\0-\x08\x0e-\x19\x7f]")
 """Bytes that no text has."""
 _NUMBER = re.compile(r"\s*[-+]?[\d.,]*\d[\d.,]*(e[-+]?\d+)?\s*", re.IGNORECASE)
@@ -90,7 +78,7 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> dict[str, Arra
     """
     try:
         content = _decode(path, files.read(path, MAX_TABLE_BYTES, "a table"))
-        lines = list(_split_lines(path, content))
+        lines = list(_split_lines(content))
     except files.FileProblem as problem:
         raise RecordingError(f"{path}: {problem}") from None
     except csv.Error as error:
@@ -104,8 +92,6 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> dict[str, Arra
     kept = [index for index, (name, _) in enumerate(columns) if name != LEFT_OUT]
     _check_names(path, [columns[index][0] for index in kept], from_file=names is None)
     table_lines = _drop_header(lines, kept)
-    if doubt := _find_ambiguous_lines(table_lines):
-        raise RecordingError(f"{path}: {doubt}")
     for number, cells in table_lines:
         _drop_empty_cells(cells, len(columns))
         if len(cells) != len(columns):
@@ -280,29 +266,14 @@ def _decode(path: Path, raw: bytes) -> str:
     """Return the text of a table; raise `RecordingError` for a file of another format."""
     if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return raw.decode("utf-16", "replace")
-    start = raw[:4096]
-    for signature, remedy in _OTHER_FORMATS.items():
-        if start.lstrip().startswith(signature):
-            raise RecordingError(f"{path}: {remedy}")
-    if any(start) and not (start[::2].strip(b"\0") and start[1::2].strip(b"\0")):
-        raise RecordingError(f"{path}: it is UTF-16 without a byte-order mark: {_SAVE}")
-    if _BINARY.search(start):
-        raise RecordingError(f"{path}: it is not a text: {_SAVE}")
+    if _BINARY.search(raw[:4096]):
+        raise RecordingError(f"{path}: it is not a text: save the table as CSV (UTF-8)")
     return raw.decode("utf-8-sig", "replace")
 
 
-def _split_lines(path: Path, content: str) -> Iterator[Line]:
-    """Yield the number and the cells of each line that is not empty.
-
-    Raise `csv.Error`, and `RecordingError` for a line that is too long.
-    """
+def _split_lines(content: str) -> Iterator[Line]:
+    """Yield the number and the cells of each line that is not empty; raise `csv.Error`."""
     lines = content.splitlines()
-    for number, line in enumerate(lines, start=1):
-        if len(line) > MAX_LINE_CHARACTERS:
-            raise RecordingError(
-                f"{path}: line {number} has more than {MAX_LINE_CHARACTERS} characters: write "
-                "each row of the table in a separate line"
-            )
     sample = [line for line in lines[:50] if line.strip()]
     delimiter = _find_delimiter(sample[-1]) if sample else None
     rows: Iterator[list[str]] = (line.split() for line in lines)
@@ -341,20 +312,6 @@ def _drop_header(lines: Sequence[Line], kept: Sequence[int]) -> Sequence[Line]:
             if _GROUPED.fullmatch(cell) or (value is not None and not math.isnan(value)):
                 return lines[begin:]
     return []
-
-
-def _find_ambiguous_lines(lines: Sequence[Line]) -> str:
-    """Return in words where an empty line separates some rows from others; empty if nowhere.
-
-    Programs write a summary there. An empty line after each row means nothing.
-    """
-    pairs = list(pairwise(number for number, _ in lines))
-    after = [number for before, number in pairs if number > before + 1]
-    if not after or len(after) == len(pairs):
-        return ""
-    return (
-        f"line {after[0]} follows an empty line: delete that, or what follows it if it is a summary"
-    )
 
 
 def _find_ambiguous_number(lines: Sequence[Line], kept: Sequence[int]) -> str:

@@ -322,7 +322,7 @@ class LiveSession(Session):
         take: take the fish from another experiment
 
         Raises `NoDaemon`, `Refused` while another experiment holds the fish, and `ConfigError`
-        for a free swimmer.
+        for a free fish.
         """
         super().__init__()
         status = fish.status()

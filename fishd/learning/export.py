@@ -12,7 +12,6 @@ import torch
 from gymnasium import wrappers
 from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
@@ -32,16 +31,14 @@ from torch.nn import Linear, ReLU, Sequential, Tanh
 
 from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config, adopt
-from fishd.controllers.policy.card import Card, History
+from fishd.controllers.policy.card import Card
 from fishd.controllers.policy.file import FRAMES, INPUT, PolicyFile
 from fishd.controllers.policy.network import Sight, to_onnx
 from fishd.controllers.policy.runtime import Network
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import FishdError, PolicyError
 from fishd.core.files import write_atomically
-from fishd.core.text import describe_error, quoted
-from fishd.lab.experiment import flatten
-from fishd.lab.links.link import StepResult
+from fishd.core.text import describe_error, line, quoted
 from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env.environment import SwimEnv, features
 from fishd.learning.env.evaluation import Evaluation, evaluate_in_simulation
@@ -61,6 +58,7 @@ TOLERANCE = 1e-4
 """Largest difference between the outputs of the file and of the trained policy, as a share of Φ:
 pixels and large weights are summed, in an order that differs between libraries."""
 NEUTRAL_WRAPPERS: tuple[type[Any], ...] = (
+    gymnasium.RewardWrapper,
     Monitor,
     VecCheckNan,
     VecMonitor,
@@ -75,7 +73,7 @@ NEUTRAL_WRAPPERS: tuple[type[Any], ...] = (
     wrappers.RenderCollection,
     wrappers.TimeLimit,
 )
-"""Wrappers of environments that change neither observations nor actions."""
+"""Wrappers of environments that change neither observations nor actions, with their subclasses."""
 _LOAD_WITH_FISH = (
     "load the model with env=gymnasium.make('fishd/Swim-v0'), with the config, settings and "
     "overrides of its training"
@@ -87,26 +85,9 @@ _MORE_REMEDIES: dict[type[Any], str] = {
     SubprocVecEnv: ", since environments in other processes cannot be checked",
 }
 """Additions to the remedy for a part of one of these types."""
-_PASSAGES = ("step", "reset", "unwrapped", "__getattribute__")
-"""Attributes through which observations and actions pass, which a wrapper of rewards inherits."""
-_HARMLESS_METHODS = {"close", "render", "reward"}
-"""Methods through which neither observations nor actions pass."""
 _PROBE_INPUTS = 1000
 _PROBE_STACKS = 100
 """Number of stacks of noise, and of stacks of a moving tail."""
-
-
-class _Proof(NamedTuple):
-    """Inputs on which a file is compared with its policy, and the outputs of the policy."""
-
-    rows: NDArray[np.float32]
-    """Numbers that the file receives, shape (inputs, numbers)."""
-    stacks: list[Stack]
-    """Frames that the file receives; empty without a camera."""
-    given: NDArray[np.float32]
-    """Inputs of the policy, shape (inputs, width)."""
-    expected: NDArray[np.float64]
-    """Outputs of the policy, φ_c/Φ, shape (inputs,)."""
 
 
 class Exported(Struct, frozen=True):
@@ -147,7 +128,7 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
     """Write the policy of a model of stable-baselines3 that was trained on a `SwimEnv`.
 
     model: PPO or A2C with an `MlpPolicy` of tanh or relu; its environments are equal, of this
-        process, and have no wrappers but `NEUTRAL_WRAPPERS` and those of rewards
+        process, and have no wrappers but `NEUTRAL_WRAPPERS`
     note: text for the user, stored in the file
 
     Warns of a policy that stalls. Raises `PolicyError` for any other model or subclass, and where
@@ -166,12 +147,12 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
             settings={"environment": msgspec.to_builtins(env.settings)},
         )
         card = replace(card, provenance=past)
-        proof = _swim(model, env, card)
     except PolicyError as problem:
         raise PolicyError(f"{path}: {problem}") from None
+    _build(path, card, policy, env.perception)  # raises before the swim
     decide = DeterministicPolicy(policy, env.perception, card.amplitude)
     evaluation = evaluate_in_simulation(env.config, decide, EvaluationSettings())
-    _write(path, _complete_card(card, evaluation), policy, env.perception, proof)
+    _write(path, _complete_card(card, evaluation), policy, env.perception)
     if evaluation.is_stalled:
         rollout = cast(OnPolicyAlgorithm, model).n_steps
         warnings.warn(
@@ -197,7 +178,7 @@ class _Part(NamedTuple):
     role: str
     part: Any
     permitted: tuple[type[Any], ...]
-    """Types that do nothing that a policy file lacks; their subclasses may."""
+    """Types that do nothing that a policy file lacks."""
     remedy: str
 
 
@@ -232,13 +213,13 @@ def _parts(model: Any) -> Iterator[_Part]:
 
 
 def _wrapper(wrapper: Any) -> _Part:
-    """Return the part of a wrapper; those that change only rewards are permitted."""
-    kind, plain = type(wrapper), gymnasium.RewardWrapper
-    is_reward = (
-        isinstance(wrapper, plain)
-        and all(getattr(kind, name) is getattr(plain, name) for name in _PASSAGES)
-    ) or (kind is VecNormalize and not wrapper.norm_obs)
-    permitted = (kind,) if is_reward else NEUTRAL_WRAPPERS
+    """Return the part of a wrapper, permitted if it changes neither observations nor actions."""
+    is_neutral = (
+        not wrapper.norm_obs
+        if isinstance(wrapper, VecNormalize)
+        else isinstance(wrapper, NEUTRAL_WRAPPERS)
+    )
+    permitted = (type(wrapper),) if is_neutral else ()
     return _Part("wrapper", wrapper, permitted, "train one without that wrapper")
 
 
@@ -252,13 +233,7 @@ def _check_model(model: Any) -> tuple[SwimEnv, ActorCriticPolicy]:
     envs = []
     for role, part, permitted, remedy in _parts(model):
         name = "missing" if part is None else type(part).__name__
-        attributes = getattr(part, "__dict__", {})
-        own = {key for key in attributes if callable(getattr(type(part), key, None))}
-        if isinstance(part, torch.nn.Module) and (part._forward_hooks or part._forward_pre_hooks):
-            own.add("hook")
-        own -= _HARMLESS_METHODS
-        if own or type(part) not in permitted:
-            name += "".join(f" with its own {key}" for key in sorted(own)[:1])
+        if type(part) not in permitted:
             remedy += _MORE_REMEDIES.get(type(part), "")
             why = ", which may do more than a policy file, so that the file would swim otherwise"
             raise PolicyError(
@@ -285,23 +260,17 @@ def _check_equal(first: SwimEnv, env: SwimEnv, number: int) -> None:
             "a model that sees pictures is not exported from Python; train it with 'fishctl learn "
             "ppo --see camera'"
         )
-    here, there = _traits(first), _traits(env)
-    here["features"] = here["perception"] = features(first.config, first.settings)
-    for key in here | there:
-        value, other = here.get(key), there.get(key)
-        if key != "config.simulation.seed" and value != other:
+    noise = replace(env.config.simulation, seed=first.config.simulation.seed)
+    for name, here, there in (
+        ("configuration", first.config, replace(env.config, simulation=noise)),
+        ("settings", first.settings, env.settings),
+        ("features", features(first.config, first.settings), env.features),
+    ):
+        if here != there:
             raise PolicyError(
-                f"{key} of environment {number} of this model is {quoted(str(other))}, not "
-                f"{quoted(str(value))} as when environment 0 was made, and a policy file has only "
-                "one: train one in equal environments"
+                f"environment {number} of this model has not the {name} with which environment 0 "
+                "was made, and a policy file has only one: train one in equal environments"
             )
-
-
-def _traits(env: SwimEnv) -> dict[str, Any]:
-    """Return configuration, settings and features of an environment, by dotted keys."""
-    settings = {"config": env.config, "settings": env.settings}
-    traits = flatten(msgspec.json.decode(msgspec.json.encode(settings)))
-    return traits | {"features": env.features, "perception": env.perception.features}
 
 
 def _check_numbers(policy: ActorCriticPolicy) -> None:
@@ -321,81 +290,20 @@ def _check_numbers(policy: ActorCriticPolicy) -> None:
             )
 
 
-class _RecordingLink(SimulatedLink):
-    """A link that stores the angle it is given."""
-
-    angle = 0.0
-    """Latest angle [rad]."""
-
-    def step(self, angle: float) -> StepResult:
-        """Apply an angle [rad], and return the result one tick later."""
-        self.angle = angle
-        return super().step(angle)
-
-
-def _swim(model: BaseAlgorithm, env: SwimEnv, card: Card) -> _Proof:
-    """Return angles of a simulated fish under the model's control: its own may be a real one.
-
-    Every second action is random. The file receives what the controller `ppo` would compute. The
-    delay of reversals is not that of the policy. Raises `PolicyError` if the model fails.
-    """
-    link = _RecordingLink(env.config)
-    settings = replace(env.settings, episode=2 * _PROBE_INPUTS, longest_start=0, dwell=False)
-    simulated = SwimEnv(link, env.config, settings)
-    history = History(card.observation, card.window)
-    random = np.random.default_rng(2)
-    rows, given, expected = [], [], []
-    observation, _ = simulated.reset(seed=2)
-    for _ in range(_PROBE_INPUTS):
-        history.push(simulated.latest)
-        rows.append(history.row.copy())
-        given.append(observation)
-        try:
-            action, _ = model.predict(observation, deterministic=True)
-            simulated.step(action)
-        except Exception as error:  # those of torch differ
-            raise PolicyError(
-                f"this model computes no action: {describe_error(error)}; export an earlier "
-                "checkpoint"
-            ) from None
-        expected.append(link.angle / card.amplitude)
-        history.push(simulated.latest)
-        action = random.uniform(-1.0, 1.0, action.shape).astype(np.float32)
-        observation, *_ = simulated.step(action)
-    return _Proof(np.array(rows), [], np.array(given), np.array(expected))
-
-
-def _draw(policy: ActorCriticPolicy, perception: Perception, card: Card) -> _Proof:
-    """Return outputs of the policy for random inputs."""
-    stacks = _probe_stacks(card)
-    number = len(stacks) or _PROBE_INPUTS
-    random = np.random.default_rng(0)
-    rows = random.normal(0.0, 1.5, (number, card.numbers)).astype(np.float32)
-    given = rows
-    if perception.extractor:
-        seen = np.array([perception.extractor.see(stack) for stack in stacks])
-        given = np.concatenate((seen, rows), axis=1)
-    expected = policy.predict(given, deterministic=True)[0][:, 0].astype(np.float64)
-    return _Proof(rows, stacks, given, expected)
-
-
-def _write(
-    target: Path,
-    card: Card,
-    policy: ActorCriticPolicy,
-    perception: Perception,
-    proof: _Proof | None = None,
-) -> int:
-    """Write the file atomically; return its size [bytes]. Raises `PolicyError`.
-
-    proof: inputs on which the file is compared with the policy; None for random ones
-    """
+def _build(target: Path, card: Card, policy: ActorCriticPolicy, perception: Perception) -> bytes:
+    """Return the content of the file; raises `PolicyError` if its outputs are other ones."""
     try:
         sight = _make_sight(policy, perception)
         content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
     except PolicyError as problem:
         raise PolicyError(f"{target}: {problem}") from None
-    _verify(PolicyFile(target, content, card), policy, proof or _draw(policy, perception, card))
+    _verify(PolicyFile(target, content, card), policy, perception)
+    return content
+
+
+def _write(target: Path, card: Card, policy: ActorCriticPolicy, perception: Perception) -> int:
+    """Write the file atomically; return its size [bytes]. Raises `PolicyError`."""
+    content = _build(target, card, policy, perception)
     if not target.name or (target.exists() and not target.is_file()):
         raise PolicyError(f"{target}: exists already, and is not a regular file")
     try:
@@ -485,22 +393,40 @@ def _complete_card(card: Card, evaluation: Evaluation, note: str = "") -> Card:
     return replace(card, provenance=past)
 
 
-def _verify(file: PolicyFile, policy: ActorCriticPolicy, proof: _Proof) -> None:
-    """Compare the file, run as on the robot, with the policy; raises `PolicyError`."""
+def _verify(file: PolicyFile, policy: ActorCriticPolicy, perception: Perception) -> None:
+    """Compare the file, run as on the robot, with the policy on random inputs.
+
+    Raises `PolicyError`.
+    """
+    stacks = _probe_stacks(file.card)
+    number = len(stacks) or _PROBE_INPUTS
+    random = np.random.default_rng(0)
+    rows = random.normal(0.0, 1.5, (number, file.card.numbers)).astype(np.float32)
+    given = rows
+    if perception.extractor:
+        seen = np.array([perception.extractor.see(stack) for stack in stacks])
+        given = np.concatenate((seen, rows), axis=1)
+    try:
+        expected = policy.predict(given, deterministic=True)[0][:, 0].astype(np.float64)
+    except Exception as error:  # those of torch differ
+        raise PolicyError(
+            f"{file.path}: this model computes no action: {line(describe_error(error), 120)}; "
+            "export an earlier checkpoint"
+        ) from None
     network = Network(file)
     outputs = []
-    for index, row in enumerate(proof.rows):
+    for index, row in enumerate(rows):
         network.row[:] = row
-        if proof.stacks:
-            network.frames[:] = proof.stacks[index]
+        if stacks:
+            network.frames[:] = stacks[index]
         outputs.append(network.run())
-    worst = float(np.abs(np.array(outputs) - proof.expected).max())
+    worst = float(np.abs(np.array(outputs) - expected).max())
     if not worst <= TOLERANCE:
         layers = MeanAction(policy)
-        computed = np.clip([layers(row) for row in proof.given], -1.0, 1.0)
+        computed = np.clip([layers(row) for row in given], -1.0, 1.0)
         cause = (
             "this version of onnxruntime computes its layers wrongly: install another one"
-            if np.abs(computed - proof.expected).max() <= TOLERANCE
+            if np.abs(computed - expected).max() <= TOLERANCE
             else "the model does more than its layers, which a policy file cannot have"
         )
         raise PolicyError(

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from fishd.camera.axis import find_motion
 from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config
-from fishd.controllers.policy import opening
+from fishd.controllers.policy import library
 from fishd.controllers.policy.card import Card, History
 from fishd.controllers.policy.file import OUTPUT, PolicyFile
-from fishd.controllers.policy.pilot import Pilot
-from fishd.controllers.policy.runtime import Network
+from fishd.controllers.policy.runtime import Network, Pilot
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
@@ -74,7 +73,7 @@ def look(
     Raises `PolicyError` for a policy that sees no pictures, does not fit, or does not react to
     them, `NoMotion` where it does not swim, and `ParameterError` for too short a swim.
     """
-    file = opening.read(policy, config.limits)
+    file = library.open_policy(policy, config.limits)
     if file.card.pictures is None:
         raise PolicyError(f"{file.path}: it sees no pictures, so it looks at nothing")
     seen = _record_swim(policy, config, Camera(camera, file.card.pictures), seconds)

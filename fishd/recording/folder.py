@@ -9,16 +9,10 @@ from typing import NamedTuple
 from fishd.core import files, text
 from fishd.core.errors import RecordingError
 from fishd.core.schema import suggest
-from fishd.recording.mcap_file import read_outline
 from fishd.recording.numbering import list_files, read_number
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX, is_being_written
-from fishd.recording.reader import (
-    COUNTED_TOPICS,
-    count_messages,
-    find_repaired_problem,
-    open_run,
-)
-from fishd.recording.summary import Summary, from_metadata
+from fishd.recording.reader import find_repaired_problem, open_run
+from fishd.recording.summary import Summary
 from fishd.recording.writer import RunWriter
 
 FOLDER_VARIABLE = "FISHD_RUNS"
@@ -158,20 +152,13 @@ def read_overview(path: Path) -> Overview:
 
     Raise `RecordingError`.
     """
-    outline = read_outline(path)
-    end = outline.metadata.get("fishd.end", {}) if outline else {}
-    summary = from_metadata(end)
-    if outline and summary and "duration" in end and "fishd.run" in outline.metadata:
-        counts = count_messages(summary)
-        if all(outline.messages[topic] == counts[topic] for topic in COUNTED_TOPICS):
-            problem = find_repaired_problem(end.get("reason", ""))
-            about = outline.metadata["fishd.run"]
-            return Overview(
-                run_name(path), path, about, summary, True, False, problem, summary.ticks
-            )
-    run = open_run(path)
-    writing = is_being_written(path)
+    run = open_run(path, with_messages=False)
+    summary = run.stated_summary
+    if summary is not None:
+        problem, is_writing = find_repaired_problem(run.reason), False
+    else:
+        run = open_run(path)
+        summary, problem, is_writing = run.summary, run.problem, is_being_written(path)
     return Overview(
-        run.name, path, run.about, run.summary, run.finished, writing, run.problem,
-        run.recorded_ticks,
-    )  # fmt: skip
+        run.name, path, run.about, summary, run.finished, is_writing, problem, run.recorded_ticks
+    )

@@ -1,11 +1,15 @@
-"""Reader of an MCAP file, record by record, that skips damaged parts and accepts a cut-off end."""
+"""Reader of an MCAP file, record by record, that skips damaged parts and accepts a cut-off end.
+
+The library parses records and chunks. Its own reader would end at the first damaged byte, and
+allocate whatever size a file claims.
+"""
 
 import os
 import re
 import struct
 import zlib
-from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -26,7 +30,7 @@ from mcap.records import (
     Schema,
     Statistics,
 )  # fmt: skip
-from zstandard import ZstdError
+from mcap.stream_reader import breakup_chunk, get_chunk_data_stream
 
 from fishd.core.errors import RecordingError
 
@@ -42,17 +46,25 @@ MIN_CONTENT_BYTES = 2**22
 _MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
 """Opcode and length, at the beginning of every record."""
-_MESSAGE_HEAD = struct.Struct("<HIQQ")
-"""Channel, sequence number, log time and publish time of a message."""
-_FOOTER_BYTES = _HEAD.size + 20
-"""Size of the footer, the last record of a finished file [bytes]."""
-_FOOTER_HEAD = _HEAD.pack(Opcode.FOOTER, 20)
-_RESUME_PATTERN = re.compile(rb"\x06.{36}\x04\0\0\0zstd|\x0c.{7}\0.\0\0\0fishd\.", re.DOTALL)
-"""Beginning of a chunk or of metadata of fishd, at which reading resumes after damaged bytes."""
-_FIRST_WINDOW_BYTES, _MAX_WINDOW_BYTES, _OVERLAP_BYTES = 2**12, 2**20, 64
-"""Sizes of the search window for it: at first, at most, and the overlap of two windows [bytes]."""
+_RESUME_PATTERN = re.compile(
+    rb"\x06.{36}\x04\0\0\0zstd|\x0c.{7}\0.\0\0\0fishd\.|\x02\x14\0{7}.{20}" + re.escape(_MAGIC),
+    re.DOTALL,
+)
+"""A chunk, metadata of fishd, or the footer: records at which reading resumes after damage."""
+_WINDOW_BYTES, _OVERLAP_BYTES = 2**16, 64
+"""Size of a part of the file that is searched at once, and the overlap of two such parts."""
+_KINDS: dict[int, type[Attachment | Chunk | Metadata | Schema | Channel | Statistics | Footer]] = {
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.CHUNK: Chunk,
+    Opcode.METADATA: Metadata,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.STATISTICS: Statistics,
+    Opcode.FOOTER: Footer,
+}
 _PARSE_ERRORS = (
-    McapError, ZstdError, struct.error, ValueError, OverflowError, MemoryError, RuntimeError
+    McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError, MemoryError,
+    RuntimeError,
 )  # fmt: skip
 """Errors of the parsers for damaged bytes; RuntimeError is that of lz4."""
 
@@ -64,8 +76,6 @@ class _Implausible(ValueError):
 class Damaged(NamedTuple):
     """Placeholder of bytes that cannot be read."""
 
-    offset: int
-    """Position of the first byte in the file."""
     reason: str = ""
     """Description of the damage; empty if unknown."""
 
@@ -79,64 +89,38 @@ class Appended(NamedTuple):
     """Whether another recording begins with them, as after `cat a.mcap b.mcap`."""
 
 
-def read_records(path: Path) -> Iterator[McapRecord | Damaged | Appended]:
-    """Yield all records but chunks and those of the index, and the content of chunks, in order.
+def read_records(
+    path: Path, *, with_messages: bool = True
+) -> Iterator[McapRecord | Damaged | Appended]:
+    """Yield all records but those of the index in order, with the content of chunks in their place.
 
-    A file that was cut off ends with its last complete chunk. Raise `RecordingError` if the file
-    cannot be read, is not an MCAP file, or expands beyond `MAX_EXPANSION`.
+    A file that was cut off ends with its last complete chunk.
+
+    with_messages: False to yield the chunks, whose content is checked in any case
+    Raise `RecordingError` if the file cannot be read, is not an MCAP file, or expands beyond
+    `MAX_EXPANSION`.
     """
-    expand = _Expander(path)
-    for offset, record in _read_outer_records(path):
-        if isinstance(record, Chunk):
-            try:
-                content = expand(record)
-                if record.uncompressed_crc not in (0, zlib.crc32(content)):
-                    raise ValueError("the checksum of a chunk is wrong")
-                yield from _split_chunk(content)
-            except RecordingError:
-                raise
-            except _PARSE_ERRORS as error:
-                yield Damaged(offset, _damage_reason(error))
-        else:
-            yield record
-
-
-class Outline(NamedTuple):
-    """Content of a finished, undamaged file, without its messages."""
-
-    metadata: dict[str, dict[str, str]]
-    """Metadata by name, the last of each."""
-    messages: Counter[str]
-    """Number of messages by topic, counted in the file itself."""
-
-
-def read_outline(path: Path) -> Outline | None:
-    """Return metadata and numbers of messages of a finished, undamaged file; else None.
-
-    This takes a sixth of the time that the messages would take. Raise like `read_records`.
-    """
-    outline = Outline({}, Counter())
-    topics: dict[int, str] = {}
-    last: McapRecord | Damaged | Appended | None = None
-    expand = _Expander(path)
-    for _, last in _read_outer_records(path):
-        if isinstance(last, Metadata):
-            outline.metadata[last.name] = last.metadata
-        elif isinstance(last, Channel):
-            topics[last.id] = last.topic
-        elif isinstance(last, Chunk):
-            try:
-                content = expand(last)
-                if zlib.crc32(content) != last.uncompressed_crc:
-                    return None
-                _count_messages(content, topics, outline.messages)
-            except RecordingError:
-                raise
-            except _PARSE_ERRORS:
-                return None
-        elif isinstance(last, Damaged | Appended | Message):
-            return None
-    return outline if isinstance(last, Footer) else None
+    try:
+        with path.open("rb") as file:
+            left = max(MIN_CONTENT_BYTES, MAX_EXPANSION * os.fstat(file.fileno()).st_size)
+            for record in _read_outer_records(path, file):
+                if not isinstance(record, Chunk):
+                    yield record
+                    continue
+                try:
+                    left -= _check_size(record)
+                    if left < 0:
+                        raise RecordingError(
+                            f"{path}: its chunks claim more than {MAX_EXPANSION} times the length "
+                            "of the file: it is not a recording of fishd"
+                        )
+                    yield from _read_chunk(record, with_messages=with_messages)
+                except _PARSE_ERRORS as error:
+                    yield Damaged(str(error) if isinstance(error, _Implausible) else "")
+    except RecordingError:
+        raise
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
 
 
 def read_first_metadata(path: Path) -> dict[str, str]:
@@ -144,216 +128,105 @@ def read_first_metadata(path: Path) -> dict[str, str]:
 
     Raise `RecordingError` if the file cannot be read, or is not an MCAP file.
     """
-    _, record = next(_read_outer_records(path), (0, None))
+    record = next(read_records(path), None)
     return record.metadata if isinstance(record, Metadata) else {}
 
 
-class _Expander:
-    """Function that returns the content of chunks, with a limit on the memory that it allocates."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        try:
-            length = path.stat().st_size
-        except OSError as error:
-            raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
-        self._left = max(MIN_CONTENT_BYTES, MAX_EXPANSION * length)
-        self._decompress = zstandard.ZstdDecompressor().decompress
-
-    def __call__(self, chunk: Chunk) -> bytes:
-        """Return the content; raise one of `_PARSE_ERRORS`, or `RecordingError` above the limit."""
-        size = chunk.uncompressed_size
-        if size > MAX_RECORD_BYTES:
-            raise _Implausible(
-                f"a chunk claims {_format_megabytes(size)}, {_format_megabytes(MAX_RECORD_BYTES)} "
-                "at most"
-            )
-        if chunk.compression == "zstd":
-            claimed = zstandard.frame_content_size(chunk.data)
-            if claimed not in (-1, size):  # the decoder would allocate it; -1: not given
-                raise _Implausible(f"a zstd frame claims {claimed} bytes, its chunk {size}")
-        self._left -= size
-        if self._left < 0:
-            raise RecordingError(
-                f"{self._path}: its chunks claim more than {MAX_EXPANSION} times the length of "
-                "the file: it is not a recording of fishd"
-            )
-        content = self._content(chunk, size)
-        if len(content) != size:
-            raise _Implausible(f"a chunk claims {size} bytes and does not have them")
-        return content
-
-    def _content(self, chunk: Chunk, size: int) -> bytes:
-        content: bytes
-        if not chunk.compression:
-            content = chunk.data
-        elif chunk.compression == "zstd":
-            # A size of 0 would mean no limit.
-            content = self._decompress(chunk.data, max_output_size=size) if size else b""
-        elif chunk.compression == "lz4":
-            content = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
-        else:
-            raise _Implausible("a chunk has an unknown compression")
-        return content
-
-
-def _split_chunk(content: bytes) -> Iterator[McapRecord]:
-    """Yield the records in the content of a chunk; raise one of `_PARSE_ERRORS`."""
-    for opcode, begin, end in _find_records(content):
-        if opcode in (Opcode.MESSAGE, Opcode.CHANNEL, Opcode.SCHEMA):
-            record = _parse_record(opcode, content[begin:end])
-            assert record is not None
-            yield record
-
-
-def _count_messages(content: bytes, topics: dict[int, str], counts: Counter[str]) -> None:
-    """Count the messages in the content of a chunk by topic; raise one of `_PARSE_ERRORS`.
-
-    topics: topics by the numbers of their channels; those of the chunk are added
-    """
-    numbers: Counter[int] = Counter()
-    for opcode, begin, end in _find_records(content):
-        if opcode == Opcode.MESSAGE:
-            numbers[int.from_bytes(content[begin : begin + 2], "little")] += 1
-        elif opcode == Opcode.CHANNEL:
-            channel = Channel.read(_StrictStream(BytesIO(content[begin:end])))
-            topics[channel.id] = channel.topic
-    for number, count in numbers.items():
-        counts[topics.get(number, "")] += count
-
-
-def _find_records(content: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, begin and end of each record in a chunk; raise one of `_PARSE_ERRORS`."""
-    begin, size = 0, len(content)
-    while begin < size:
-        opcode, length = _HEAD.unpack_from(content, begin)
-        begin += _HEAD.size
-        if length > size - begin:
-            raise EndOfFile
-        yield opcode, begin, begin + length
-        begin += length
-
-
-def _damage_reason(error: Exception) -> str:
-    return str(error) if isinstance(error, _Implausible) else ""
-
-
-def _format_megabytes(size: int) -> str:
-    return f"{size / 2**20:.0f} MB"
-
-
-def _read_outer_records(path: Path) -> Iterator[tuple[int, McapRecord | Damaged | Appended]]:
-    """Yield position and content of each record outside of chunks, including the chunks."""
-    try:
-        with path.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            if size == 0:
-                raise RecordingError(
-                    f"{path} is empty, as a power cut may leave a file; delete it, there is "
-                    "nothing to recover"
-                )
-            if file.read(len(_MAGIC)) != _MAGIC:
-                raise RecordingError(f"{path} is not an MCAP file")
-            offset = len(_MAGIC)
-            while offset < size:
-                opcode, length, body = _read_record(file, offset, size)
-                if body is None:
-                    next_offset = _resume(file, offset + 1, size)
-                    if next_offset is None and opcode > 0 and length <= MAX_RECORD_BYTES:
-                        return  # the file was cut off here
-                    yield offset, Damaged(offset, _length_problem(length, size))
-                    if next_offset is None:
-                        return
-                    offset = next_offset
-                    continue
-                try:
-                    record = _parse_record(opcode, body)
-                except _PARSE_ERRORS as error:
-                    why = _damage_reason(error)
-                    yield offset, Damaged(offset, why)
-                else:
-                    if isinstance(record, Footer):
-                        end = offset + _HEAD.size + len(body) + len(_MAGIC)
-                        if end < size:
-                            file.seek(end)
-                            is_recording = file.read(len(_MAGIC)) == _MAGIC
-                            yield offset, Appended(size - end, is_recording)
-                        yield offset, record
-                        return
-                    if record is not None:
-                        yield offset, record
-                offset += _HEAD.size + len(body)
-    except RecordingError:
-        raise
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
-
-
-def _read_record(file: IO[bytes], offset: int, size: int) -> tuple[int, int, bytes | None]:
-    """Return opcode, length and content of the record there; no content if it is invalid.
-
-    At the cut-off end of a file, the head may be incomplete, too.
-    """
-    file.seek(offset)
-    head = file.read(_HEAD.size)
-    if len(head) < _HEAD.size:
-        return head[0], 0, None
-    opcode, length = _HEAD.unpack(head)
-    if not opcode or length > min(MAX_RECORD_BYTES, size - offset - _HEAD.size):
-        return opcode, length, None
-    return opcode, length, file.read(length)
-
-
-def _length_problem(length: int, size: int) -> str:
-    """Return the problem of a record with an excessive length; empty for other problems."""
-    if MAX_RECORD_BYTES < length < size:
-        return (
-            f"a record of {_format_megabytes(length)}, {_format_megabytes(MAX_RECORD_BYTES)} at "
-            "most"
+def _check_size(chunk: Chunk) -> int:
+    """Return the size of the content of a chunk [bytes]; raise `_Implausible`."""
+    size = chunk.uncompressed_size
+    if size > MAX_RECORD_BYTES:
+        raise _Implausible(
+            f"a chunk claims {size / 2**20:.0f} MB, {MAX_RECORD_BYTES / 2**20:.0f} MB at most"
         )
-    return ""
+    if chunk.compression == "zstd":
+        claimed = zstandard.frame_content_size(chunk.data)
+        if claimed not in (-1, size):  # the decoder would allocate it; -1: not given
+            raise _Implausible(f"a zstd frame claims {claimed} bytes, its chunk {size}")
+    elif chunk.compression not in ("", "lz4"):
+        raise _Implausible("a chunk has an unknown compression")
+    return size
 
 
-def _resume(file: IO[bytes], offset: int, size: int) -> int | None:
+def _read_chunk(chunk: Chunk, *, with_messages: bool) -> list[McapRecord]:
+    """Return the content of a chunk of checked size, or that chunk; raise `_PARSE_ERRORS`."""
+    checked = chunk
+    if chunk.compression == "lz4":  # the library would decode it without a limit
+        limit = chunk.uncompressed_size + 1
+        content = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=limit)
+        checked = replace(chunk, compression="", data=content)
+    if with_messages:
+        return breakup_chunk(checked, validate_crc=True)
+    get_chunk_data_stream(checked, validate_crc=True)
+    return [chunk]
+
+
+def _read_outer_records(path: Path, file: IO[bytes]) -> Iterator[McapRecord | Damaged | Appended]:
+    """Yield each record outside of chunks, including the chunks."""
+    size = os.fstat(file.fileno()).st_size
+    if size == 0:
+        raise RecordingError(
+            f"{path} is empty, as a power cut may leave a file; delete it, there is nothing to "
+            "recover"
+        )
+    if file.read(len(_MAGIC)) != _MAGIC:
+        raise RecordingError(f"{path} is not an MCAP file")
+    offset: int | None = len(_MAGIC)
+    while offset is not None and offset < size:
+        file.seek(offset)
+        head = file.read(_HEAD.size)
+        opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (head[0], 0)
+        end = offset + _HEAD.size + length
+        if not opcode or length > MAX_RECORD_BYTES or end > size:
+            next_offset = _find_next_record(file, offset + 1, size)
+            if next_offset is None and opcode and length <= MAX_RECORD_BYTES:
+                return  # the file was cut off here
+            yield Damaged()
+            offset = next_offset
+            continue
+        try:
+            record = _parse_record(opcode, file.read(length))
+        except _PARSE_ERRORS:
+            record = Damaged()
+        if isinstance(record, Footer):
+            if (appended := size - end - len(_MAGIC)) > 0:
+                yield Appended(appended, file.read(2 * len(_MAGIC)) == 2 * _MAGIC)
+            yield record
+            return
+        if record is not None:
+            yield record
+        offset = end
+
+
+def _find_next_record(file: IO[bytes], offset: int, size: int) -> int | None:
     """Return the position of the next intact record; None if the rest is damaged."""
-    searched = _FIRST_WINDOW_BYTES
     while offset < size:
         file.seek(offset)
-        window = file.read(searched)
+        window = file.read(_WINDOW_BYTES)
         for match in _RESUME_PATTERN.finditer(window):
             position = offset + match.start()
             _, length = _HEAD.unpack_from(window, match.start())
             if length <= min(MAX_RECORD_BYTES, size - position - _HEAD.size):
                 return position
-        offset += searched - _OVERLAP_BYTES
-        searched = min(2 * searched, _MAX_WINDOW_BYTES)
-    end = max(0, size - _FOOTER_BYTES - len(_MAGIC))
-    file.seek(end)
-    tail = file.read()
-    return end if tail.startswith(_FOOTER_HEAD) and tail.endswith(_MAGIC) else None
+        offset += _WINDOW_BYTES - _OVERLAP_BYTES
+    return None
 
 
-def _parse_record(opcode: int, body: bytes) -> McapRecord | None:
+def _parse_record(opcode: int, body: bytes) -> McapRecord | Damaged | None:
     """Return a record; None for kinds that are not needed, such as those of the index.
 
     MCAP reserves opcodes for its later versions and for other programs; a reader skips them.
     """
     stream = _StrictStream(BytesIO(body))
-    match opcode:
-        case Opcode.MESSAGE:
-            channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(body)
-            data = body[_MESSAGE_HEAD.size :]
-            record: McapRecord = Message(channel, log_time, data, publish_time, sequence)
-        case Opcode.ATTACHMENT:
-            (checksum,) = struct.unpack_from("<I", body, len(body) - 4)
-            if checksum not in (0, zlib.crc32(memoryview(body)[:-4])):
-                raise ValueError("the checksum of an attachment is wrong")
-            record = Attachment.read(stream)
-        case _:
-            if opcode not in _KINDS:
-                return None
-            record = _KINDS[opcode].read(stream)
-    return record
+    if opcode == Opcode.MESSAGE:
+        message: Message = Message.read(stream, len(body))
+        return message
+    if opcode == Opcode.ATTACHMENT:  # the library does not check them
+        (checksum,) = struct.unpack_from("<I", body, len(body) - 4)
+        if checksum not in (0, zlib.crc32(memoryview(body)[:-4])):
+            return Damaged()
+    kind = _KINDS.get(opcode)
+    return kind.read(stream) if kind else None
 
 
 class _StrictStream(ReadDataStream):
@@ -365,13 +238,3 @@ class _StrictStream(ReadDataStream):
         if len(data) != length:
             raise EndOfFile
         return data
-
-
-_KINDS: dict[int, type[Chunk | Metadata | Schema | Channel | Statistics | Footer]] = {
-    Opcode.CHUNK: Chunk,
-    Opcode.METADATA: Metadata,
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-    Opcode.STATISTICS: Statistics,
-    Opcode.FOOTER: Footer,
-}

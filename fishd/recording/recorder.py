@@ -1,10 +1,9 @@
 """Recorder of a running fishd: a separate process that subscribes to telemetry."""
 
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import msgspec
 import zmq
@@ -12,16 +11,15 @@ import zmq
 from fishd.client import Fish
 from fishd.client.zmq_sockets import TELEMETRY_TIMEOUT_S, Subscription, connect_subscriber
 from fishd.core import text
-from fishd.core.camera_frames import Pixels
 from fishd.core.errors import FishError, NoDaemon, RecordingError, Refused
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Status
-from fishd.recording.images import FrameHead
 from fishd.recording.summary import TickHead
 from fishd.recording.writer import CHANNELS, RunWriter
 
 if TYPE_CHECKING:
     from fishd.core.keys import Access
+    from fishd.recording.camera_tap import CameraTap
 
 DRAIN_INTERVAL_S = 0.2
 """Interval at which messages are read from their queue, to wake up rarely [s]."""
@@ -48,8 +46,6 @@ STATUS_FIELDS = (
     "realtime",
 )
 """Fields of the status of each fishd that are recorded."""
-MAX_UNSENT_LINES = 100
-"""Maximum number of lines that wait to be sent to fishd; older ones are dropped."""
 MAX_WAITING_MESSAGES = 20000
 """Maximum number of messages that wait for a delayed recorder: a quarter of an hour."""
 MAX_STALL_S = 1.0
@@ -58,30 +54,6 @@ TAKEOVER_MESSAGE = (
     "another fishd has taken over: the recording continues with it; whether ticks of the former "
     "one were lost is not known"
 )
-
-
-class NewFrames(NamedTuple):
-    """News and frames of a camera since the previous call."""
-
-    news: list[str]
-    """One line for the user per change of the camera's state."""
-    frames: list[tuple[FrameHead, Pixels]]
-
-
-class FrameSource(Protocol):
-    """A camera whose frames are recorded; its errors never end the recording."""
-
-    def set_time(self, t: float, monotonic: float) -> None:
-        """Set the clock offset from the times of a tick: unix, and on fishd's clock [s]."""
-
-    def take(self) -> NewFrames:
-        """Return the news and frames since the previous call."""
-
-    def count_missing(self) -> int | None:
-        """Return how many published frames have not arrived; None if the camera does not say."""
-
-    def close(self) -> None:
-        """Disconnect; may be called twice."""
 
 
 class Position(NamedTuple):
@@ -105,7 +77,7 @@ class Recorder:
         after: Position | None = None,
         progress: Callable[[RunWriter], None] = lambda writer: None,
         due: Callable[[RunWriter], bool] = lambda writer: False,
-        camera: FrameSource | None = None,
+        camera: "CameraTap | None" = None,
     ) -> None:
         """
         endpoint: control socket of fishd; None for that of this machine
@@ -125,8 +97,6 @@ class Recorder:
         self._described: Description | None = None
         self._after = after
         self._seq = 0
-        self._unsent: deque[str] = deque(maxlen=MAX_UNSENT_LINES)
-        """Lines that could not be sent to fishd yet, since it did not answer in time."""
         self._gone = False
         self._refused = 0
         """Number of messages that are not fishd's."""
@@ -297,24 +267,15 @@ class Recorder:
         self._doubt(line)
         self.reason = f"{self.reason}; {line}"
 
-    def _take_frames(self, camera: FrameSource) -> None:
+    def _take_frames(self, camera: "CameraTap") -> None:
         news, frames = camera.take()
         for line in news:
             self._tell(line)
-            self._unsent.append(text.line(line))
-        if self._unsent and not self._gone:
-            self._send_lines()
+            with suppress(FishError), Fish(self._endpoint, timeout=0.5) as fish:
+                fish.mark(text.line(line))
         for head, pixels in frames:
             if lost := self.writer.frame(head, pixels):
                 self._lose(f"just before frame {head.seq}, frames were lost: {lost}")
-
-    def _send_lines(self) -> None:
-        """Send waiting lines to fishd as events; keep those that it does not answer for later."""
-        with suppress(FishError), Fish(self._endpoint, timeout=0.5) as fish:
-            while self._unsent:
-                with suppress(Refused):
-                    fish.mark(self._unsent[0])
-                self._unsent.popleft()
 
     def _close(self) -> None:
         if self._telemetry:

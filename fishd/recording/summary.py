@@ -24,7 +24,7 @@ class Gap(NamedTuple):
     """Number of missing ticks."""
 
 
-class Summary(Struct, frozen=True):
+class Summary(Struct):
     """Summary of a recording; part of its last record `fishd.end`."""
 
     begins: float = 0.0
@@ -108,24 +108,22 @@ class Tally:
         self._last: TickHead | Tick | None = None
         self._sent = 0
         """Number of the latest tick that the present fishd is known to have published; 0 if no."""
-        self._first_t = self._first = self._position = 0.0
+        self._counts = Summary(swim_ticks={})
+        """What was counted until now; `summary` adds what is computed."""
+        self._first = self._position = 0.0
         self._clock_steps = ClockSteps()
         self._is_real_time = True
-        self._ticks = self._events = self._marks = self._missed = self._restarts = 0
         self._pid = self._known = 0
         self._impulse = 0.0
         self._known_ticks = 0
         self._thrust = self._error = 0.0
         self._energy, self._metered = 0.0, 0
-        self._swimming: dict[str, int] = {}
-        self._force_unit = "N"
-        self._frames = self._frame_gaps = self._frames_lost = 0
         self._last_frame: FrameHead | None = None
 
     def set_daemon(self, daemon: Mapping[str, str]) -> None:
         """Set the metadata of the fishd of the following ticks."""
-        if self._force_unit == "N":
-            self._force_unit = daemon.get("force_unit", "N")
+        if self._counts.force_unit == "N":
+            self._counts.force_unit = daemon.get("force_unit", "N")
         self._is_real_time = find_kind(daemon.get("robot", "")).is_real_time
 
     def add(self, message: TickHead | Tick | Event | Status, position: float) -> None:
@@ -150,7 +148,8 @@ class Tally:
                 tick.t,
                 tick.time + 1e-6 * tick.busy_time_us,
             )
-        self._ticks += 1
+        counts = self._counts
+        counts.ticks += 1
         if tick.mode == "running":
             self._impulse += tick.fx
             if tick.thrust_ci95 is not UNSET and tick.frequency:
@@ -160,7 +159,7 @@ class Tally:
             if tick.power is not UNSET:
                 self._energy += tick.power
                 self._metered += 1
-            self._swimming[tick.controller] = self._swimming.get(tick.controller, 0) + 1
+            counts.swim_ticks[tick.controller] = counts.swim_ticks.get(tick.controller, 0) + 1
         is_same_fishd = last is None or tick.seq > last.seq
         if not is_same_fishd:  # it counts from 1
             self._sent = 0
@@ -168,24 +167,24 @@ class Tally:
             self._expect(tick.seq - 1, before_gap)
         self._sent = max(self._sent, tick.seq)
         if last is None:
-            self._first_t, self._first = tick.t, position
+            counts.begins, self._first = tick.t, position
             return True
         if is_same_fishd:
-            self._missed += max(0, tick.missed_slots - last.missed_slots)
+            counts.missed_slots += max(0, tick.missed_slots - last.missed_slots)
         else:
-            self._restarts += 1
+            counts.restarts += 1
         return is_same_fishd
 
     def status(self, status: Status) -> None:
         """Add a status, which reveals lost ticks, and another fishd with higher tick numbers."""
         if self._last and status.seq < self._last.seq:  # its next tick will reveal it
             return
-        if self._pid not in (0, status.pid) and self._known == self._restarts:
-            self._restarts += 1
+        if self._pid not in (0, status.pid) and self._known == self.restarts:
+            self._counts.restarts += 1
         elif self._sent:
             self._expect(status.seq, self.seconds)
         self._sent = max(self._sent, status.seq)
-        self._pid, self._known = status.pid, self._restarts
+        self._pid, self._known = status.pid, self.restarts
 
     def expect(self, seq: int) -> None:
         """Count the ticks that follow this number as lost if they are not added."""
@@ -198,8 +197,8 @@ class Tally:
 
     def event(self, event: Event) -> None:
         """Add an event."""
-        self._events += 1
-        self._marks += event.kind == "mark"
+        self._counts.events += 1
+        self._counts.marks += event.kind == "mark"
 
     def frame(self, frame: FrameHead) -> int:
         """Add a frame of a camera; return the number of frames that are missing before it.
@@ -207,21 +206,20 @@ class Tally:
         After a restart of the camera that number is unknown; the restart counts as one gap.
         """
         last, self._last_frame = self._last_frame, frame
-        self._frames += 1
+        self._counts.frames += 1
         if last is None:
             return 0
         if frame.session != last.session:
-            self._frame_gaps += 1
+            self._counts.frame_gaps += 1
             return 0
         lost = max(0, frame.seq - last.seq - 1) + max(0, frame.dropped_frames - last.dropped_frames)
-        self._frames_lost += lost
-        self._frame_gaps += lost > 0
+        self.lose_frames(lost)
         return lost
 
     def lose_frames(self, count: int) -> None:
         """Count frames that were published after the latest one that was added."""
-        self._frames_lost += count
-        self._frame_gaps += count > 0
+        self._counts.lost_frames += count
+        self._counts.frame_gaps += count > 0
 
     @property
     def seq(self) -> int:
@@ -231,7 +229,7 @@ class Tally:
     @property
     def restarts(self) -> int:
         """Number of times that another fishd took over."""
-        return self._restarts
+        return self._counts.restarts
 
     @property
     def seconds(self) -> float:
@@ -246,30 +244,21 @@ class Tally:
     @property
     def summary(self) -> Summary:
         """Summary of everything added until now."""
-        swimming_ticks = sum(self._swimming.values())
-        thrust = self._impulse / swimming_ticks if swimming_ticks else None
+        swim_ticks = dict(self._counts.swim_ticks)
+        thrust = self._impulse / sum(swim_ticks.values()) if swim_ticks else None
         error = None
         if self._known_ticks:
             thrust, error = self._thrust / self._known_ticks, self._error / self._known_ticks
-        return Summary(
-            begins=self._first_t,
+        return msgspec.structs.replace(
+            self._counts,
             ends=self._last.t if self._last else 0.0,
             duration=self.seconds,
-            ticks=self._ticks,
-            events=self._events,
-            marks=self._marks,
             gaps=len(self.gaps),
             lost_ticks=sum(gap.lost for gap in self.gaps),
-            missed_slots=self._missed,
-            restarts=self._restarts,
             thrust=thrust,
             thrust_ci95=error,
             power=self._energy / self._metered if self._metered else None,
-            swim_ticks=dict(self._swimming),
-            force_unit=self._force_unit,
-            frames=self._frames,
-            frame_gaps=self._frame_gaps,
-            lost_frames=self._frames_lost,
+            swim_ticks=swim_ticks,
             clock_steps=tuple(self.clock_steps),
         )
 

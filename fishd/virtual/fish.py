@@ -55,7 +55,7 @@ class SimulatedFish:
         if self._watches:
             self._watches = [watch for watch in self._watches if not watch.closed]
             for watch in self._watches:
-                watch.add([Pair(now - duration, now, fx, fy)], "")
+                watch.add([Pair(now - duration, now, fx, fy)], None)
         fx, fy = self.calibration.forces(fx, fy)
         newest, mean_time = now - 0.5 * duration / samples, now - 0.5 * duration
         return Measurement(newest, fx, fy, samples, mean_time=mean_time, span=duration)

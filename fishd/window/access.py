@@ -11,7 +11,7 @@ from msgspec import Meta, Struct
 
 from fishd import __version__
 from fishd.window.answers import ApiError, NoArguments, read_body, success
-from fishd.window.devices import DEVICE_S, Device, Scope
+from fishd.window.devices import Device, Scope
 from fishd.window.paired_devices import PairedDevices
 from fishd.window.places import is_loopback as is_loopback_address
 from fishd.window.web_server import check_body, host_name
@@ -20,6 +20,8 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 COOKIE = "fishd_window"
+COOKIE_S = 365 * 86400
+"""Time for which a browser keeps its cookie [s]."""
 MAX_PAIRING_BYTES = 512
 """Largest size of a request of a device that may not be paired [bytes]."""
 PAIRING_TIMEOUT_S = 1.0
@@ -135,7 +137,7 @@ class AccessControl:
         response.set_cookie(
             COOKIE,
             secret,
-            max_age=int(DEVICE_S),
+            max_age=COOKIE_S,
             path="/",
             httponly=True,
             samesite="Strict",

@@ -24,12 +24,8 @@ class JobError(FishdError):
     """A job cannot be started, or there is none."""
 
 
-async def spawn(words: list[str], runs: Path, *held: int) -> asyncio.subprocess.Process:
-    """Start fishctl.
-
-    runs: folder of recordings and experiments
-    held: descriptors that it keeps open as long as it runs
-    """
+async def spawn(words: list[str], runs: Path) -> asyncio.subprocess.Process:
+    """Start fishctl; runs: folder of recordings and experiments."""
     return await asyncio.create_subprocess_exec(
         *python_command("-c", _CHILD, str(os.getpid()), *words),
         stdin=asyncio.subprocess.DEVNULL,
@@ -37,13 +33,12 @@ async def spawn(words: list[str], runs: Path, *held: int) -> asyncio.subprocess.
         stderr=asyncio.subprocess.PIPE,
         env={**os.environ, "FISHD_RUNS": str(runs), "PYTHONUNBUFFERED": "1"},
         start_new_session=True,  # Ctrl-C in this terminal is for the window
-        pass_fds=held,
     )
 
 
-async def call(words: list[str], runs: Path, *held: int) -> bytes:
+async def call(words: list[str], runs: Path) -> bytes:
     """Run fishctl like `spawn`, and return its output; raise `JobError`."""
-    process = await spawn(words, runs, *held)
+    process = await spawn(words, runs)
     output, errors = await process.communicate()
     if process.returncode and not output:
         message = text.line(errors.decode("utf-8", "replace"))

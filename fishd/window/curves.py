@@ -6,21 +6,18 @@ import shutil
 from pathlib import Path
 
 from fishd.window.children import call
-from fishd.window.scratch import Scratch
 
 _COLUMNS = ("time", "fx", "fy", "phi_c", "alpha", "thrust")
 """Columns of a recording that a page draws."""
 
 
-async def read_curve(
-    recording: Path, runs: Path, scratch: Scratch
-) -> dict[str, list[float | None]]:
-    """Return columns of a recording in the scratch folder, and remove it; raise `JobError`."""
+async def read_curve(recording: Path, runs: Path) -> dict[str, list[float | None]]:
+    """Return columns of a recording, and remove it; raise `JobError`."""
     folder = recording.with_suffix("")
     await asyncio.to_thread(folder.mkdir)
     try:
         words = ["export", str(recording), "--csv", f"--to={folder}", "--force"]
-        await call(words, runs, scratch.descriptor)
+        await call(words, runs)
         return await asyncio.to_thread(_read_columns, folder)
     finally:
         await asyncio.to_thread(_remove, recording, folder)

@@ -11,7 +11,7 @@ import secrets
 import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -20,17 +20,13 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from fishd.core import files, text
+from fishd.core.clock import read_boot_id
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError
-from fishd.window.expiry import SteadyClock, boot_id, boot_time, is_synchronised
 
 Scope = Literal["watch", "drive"]
 INVITATION_S = 600.0
 """Time within which a token pairs a device [s]."""
-DEVICE_S = 365 * 86400.0
-"""Time for which a device stays paired [s]."""
-DROP_RETRY_S = 60.0
-"""Time between two attempts to remove what has expired from the file [s]."""
 MAX_INVITATIONS = 20
 MAX_DEVICES = 200
 MAX_NAME_CHARACTERS = 40
@@ -77,7 +73,7 @@ class Invitation(Struct, frozen=True):
     @property
     def is_valid(self) -> bool:
         """Whether it pairs a device."""
-        return self.boot == boot_id() and boot_time() < self.until
+        return self.boot == read_boot_id() and _boot_time() < self.until
 
 
 class _Content(Struct, frozen=True):
@@ -113,33 +109,19 @@ class Devices:
                 f"'chmod go-w {folder}'"
             )
         self._content, self._version = _Content(), (0, 0, 0)
-        self._clock: SteadyClock | None = None
-        self._next_drop = 0.0
-
-    def now(self) -> float:
-        """Return the time by which devices expire [s, unix]."""
-        if self._clock is None:
-            seen = (device.seen for device in self._content.devices)
-            self._clock = SteadyClock(max(seen, default=0.0))
-        return self._clock.now()
 
     def invite(self, scope: Scope, seconds: float = INVITATION_S) -> str:
         """Return a new token that pairs one device within this time."""
         token = secrets.token_urlsafe(16)
-        invitation = Invitation(hash_token(token), scope, boot_time() + seconds, boot_id())
+        invitation = Invitation(hash_token(token), scope, _boot_time() + seconds, read_boot_id())
         with self._changing() as content:
             valid = [entry for entry in content.invitations if entry.is_valid]
             kept = (*valid[1 - MAX_INVITATIONS :], invitation)
             self._write(replace(content, invitations=kept))
         return token
 
-    def pair(
-        self, token: str, name: str, is_wanted: Callable[[], bool] = lambda: True
-    ) -> tuple[Device, str]:
-        """Use up a token; return the new device, and the token for its cookie.
-
-        is_wanted: returns whether a browser still waits for this token, just before it is stored
-        """
+    def pair(self, token: str, name: str) -> tuple[Device, str]:
+        """Use up a token; return the new device, and the token for its cookie."""
         digest, secret = hash_token(token), secrets.token_urlsafe(32)
         with self._changing() as content:
             match = next((entry for entry in content.invitations if entry.token == digest), None)
@@ -152,52 +134,21 @@ class Devices:
                     f"{MAX_DEVICES} devices are paired: revoke some with 'fishctl window revoke'"
                 )
             taken = {device.name for device in content.devices}
-            now = self.now()
             wanted = text.line(name, MAX_NAME_CHARACTERS) or "device"
             device = Device(
                 id=secrets.token_hex(4),
                 name=files.unused_name(wanted, taken.__contains__, " "),
                 scope=match.scope,
                 token=hash_token(secret),
-                paired=max(now, time.time()),  # which may have been set since
-                seen=now,
+                paired=time.time(),
+                seen=time.time(),
             )
-            if not is_wanted():
-                raise DevicesBusy("the browser no longer waits to be paired")
             others = tuple(entry for entry in content.invitations if entry is not match)
             self._write(_Content((*content.devices, device), others))
         return device, secret
 
     def all(self) -> tuple[Device, ...]:
-        """Return all devices whose access has not expired; remove from the file what has."""
-        self.list_stored()
-        if self._drop(self._content) != self._content and time.monotonic() >= self._next_drop:
-            self._next_drop = time.monotonic() + DROP_RETRY_S
-            with suppress(DeviceError, OSError), self._changing(timeout=0.0) as content:
-                self._write(self._drop(content))
-                self._next_drop = 0.0
-        return tuple(device for device in self._content.devices if self.is_paired(device))
-
-    def is_paired(self, device: Device) -> bool:
-        """Return whether the access of a device has not expired; reads no disk."""
-        return self.now() - device.paired < DEVICE_S
-
-    def _drop(self, content: _Content) -> _Content:
-        """Return the content without what has expired for certain: a wall clock may be wrong."""
-        devices, now = content.devices, time.time()
-        expired = {d.id for d in devices if not self.is_paired(d) and now - d.paired >= DEVICE_S}
-        if not expired or not is_synchronised():
-            expired = set()
-        return _Content(
-            tuple(device for device in devices if device.id not in expired),
-            tuple(entry for entry in content.invitations if entry.is_valid),
-        )
-
-    def list_stored(self) -> tuple[Device, ...]:
-        """Return the devices in the file.
-
-        A command that runs while the wall clock is wrong must not decide what has expired.
-        """
+        """Return the devices in the file."""
         if self._version_now() != self._version:
             self._read()
         return self._content.devices
@@ -217,7 +168,7 @@ class Devices:
 
     def revoke(self, name: str) -> Device:
         """Remove the device with this name or id; raise `DeviceError` if there is none."""
-        stored = self.list_stored()
+        stored = self.all()
         match = next((entry for entry in stored if name in (entry.name, entry.id)), None)
         if match is None:
             known = ", ".join(entry.name for entry in stored) or "there is none"
@@ -314,6 +265,11 @@ def _try_to_lock(descriptor: int) -> bool:
     except BlockingIOError:
         return False
     return True
+
+
+def _boot_time() -> float:
+    """Return the time since this machine has started [s], which no step of its clock moves."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 def _give_to_owner(folder: Path, descriptor: int) -> None:

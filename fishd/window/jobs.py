@@ -25,7 +25,6 @@ from fishd.window.children import JobError, spawn
 from fishd.window.curves import read_curve
 from fishd.window.job_options import DRIVING_KINDS, ResumeOptions, list_words
 from fishd.window.runs import Runs
-from fishd.window.scratch import Scratch
 
 MAX_RUNNING_JOBS = 4
 MAX_REMEMBERED_JOBS = 20
@@ -73,12 +72,14 @@ class Jobs:
     def __init__(
         self,
         runs: Path,
+        scratch: Path,
         tell: Callable[[Job], None],
         keep: Callable[[list[Job]], object],
         show_folder: bool = False,
     ) -> None:
         """
         runs: folder of recordings and experiments
+        scratch: folder for what jobs leave for this window only
         tell: receives a job that has changed
         keep: receives the jobs that run, where one begins or ends
         show_folder: whether the commands that pages show name the folder
@@ -94,8 +95,8 @@ class Jobs:
         self._stopping: set[str] = set()
         self._pending: set[str] = set()
         self._count = 0
-        self._scratch = Scratch("fishd-window-")
-        self.runs = Runs(runs, self._scratch)
+        self._scratch = scratch
+        self.runs = Runs(runs, scratch)
         self._folder = runs
         self._starting = asyncio.Lock()
 
@@ -105,7 +106,6 @@ class Jobs:
             self.stop(name)
         if self._tasks:
             await asyncio.wait(self._tasks.values(), timeout=CLOSE_TIMEOUT_S)
-        self._scratch.close()
 
     def all(self) -> list[Job]:
         """Return all jobs, the oldest first."""
@@ -188,7 +188,6 @@ class Jobs:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise JobError(f"{self._folder} cannot be created: {error.strerror}") from None
-        self._scratch.create()
         if kind == "resume":
             return self._resume(options)
         run = f"{kind}-{datetime.now():%Y%m%d-%H%M%S}" if kind in DRIVING_KINDS else ""
@@ -249,11 +248,11 @@ class Jobs:
         if job.kind == "simulate":
             return [f"--record={self._recording_of(job)}", "--json"]
         place = [] if is_resumed else ["--on=live", f"--folder={self._folder / job.run}"]
-        return [*place, f"--plot={self._scratch.folder}/{job.id}.png", "--json"]
+        return [*place, f"--plot={self._scratch}/{job.id}.png", "--json"]
 
     def _recording_of(self, job: Job) -> Path:
         """Return the path of the recording of a simulated fish."""
-        return self._scratch.folder / f"simulate-{job.id}.mcap"
+        return self._scratch / f"simulate-{job.id}.mcap"
 
     def _keep_running(self) -> None:
         self._keep([job for job in self._jobs.values() if job.state == "running"])
@@ -289,7 +288,7 @@ class Jobs:
             with suppress(msgspec.DecodeError):
                 job.result = msgspec.json.decode(output)
             if job.kind == "simulate" and job.exit == 0:
-                curve = await read_curve(self._recording_of(job), self._folder, self._scratch)
+                curve = await read_curve(self._recording_of(job), self._folder)
                 job.result = {**job.result, "curve": curve}
             await asyncio.to_thread(self._keep_picture, job)
             stopped = job.id in self._stopping
@@ -312,13 +311,13 @@ class Jobs:
         """Move the picture of an experiment into its folder."""
         if not job.run:
             return
-        picture, folder = self._scratch.folder / f"{job.id}.png", self._folder / job.run
+        picture, folder = self._scratch / f"{job.id}.png", self._folder / job.run
         if picture.exists() and folder.is_dir():
             shutil.move(picture, folder / f"{job.kind}.png")
 
     async def _run_child(self, job: Job, words: list[str]) -> bytes:
         """Run fishctl; return its output."""
-        process = await spawn(words, self._folder, self._scratch.descriptor)
+        process = await spawn(words, self._folder)
         self._processes[job.id] = process
         if job.id in self._stopping:
             self._signal(job.id, signal.SIGINT)

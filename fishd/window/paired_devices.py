@@ -6,7 +6,6 @@ device keeps its access, so that its emergency stop works.
 
 import asyncio
 import logging
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -22,8 +21,6 @@ T = TypeVar("T")
 
 MAX_WAITING_CHANGES = 8
 """Number of changes above which a further one is refused."""
-CHANGE_TIMEOUT_S = 5.0
-"""Longest wait for the disk of the devices [s]."""
 SEEN_PERIOD_S = 3600.0
 """Shortest time between two stored times at which a device was seen [s]."""
 SEEN_RETRY_S = 60.0
@@ -50,8 +47,8 @@ class PairedDevices:
             self._devices = self._file.read_copy()
 
     def all(self) -> tuple[Device, ...]:
-        """Return all devices whose access has not expired."""
-        return tuple(device for device in self._devices if self._file.is_paired(device))
+        """Return all devices."""
+        return self._devices
 
     def find(self, secret: str | None) -> Device | None:
         """Return the device with this token in its cookie, and note that it was seen."""
@@ -60,7 +57,7 @@ class PairedDevices:
         digest = hash_token(secret)
         device = next((entry for entry in self.all() if entry.token == digest), None)
         if device:
-            self._seen[device.id] = self._file.now()
+            self._seen[device.id] = time.time()
         return device
 
     def get(self, identity: str) -> Device:
@@ -72,13 +69,7 @@ class PairedDevices:
 
     async def pair(self, token: str, name: str) -> tuple[Device, str]:
         """Use up a token; return the new device, and the token for its cookie."""
-        is_late = threading.Event()
-        try:
-            return await self._change(
-                lambda: self._file.pair(token, name, lambda: not is_late.is_set())
-            )
-        finally:
-            is_late.set()
+        return await self._change(lambda: self._file.pair(token, name))
 
     async def revoke(self, name: str) -> Device:
         """Remove the device with this name or id; raise `DeviceError` if there is none."""
@@ -100,20 +91,12 @@ class PairedDevices:
         if self._waiting >= MAX_WAITING_CHANGES:
             raise DevicesBusy("too many devices are being paired; try again later")
         self._waiting += 1
-        changing = asyncio.get_running_loop().run_in_executor(self._disk, change_and_read)
-        changing.add_done_callback(self._end_change)
         try:
-            async with asyncio.timeout(CHANGE_TIMEOUT_S):
-                return await asyncio.shield(changing)
-        except TimeoutError:
-            raise DevicesBusy("the disk of the paired devices does not answer") from None
+            return await asyncio.get_running_loop().run_in_executor(self._disk, change_and_read)
         except OSError as error:
             raise DevicesBusy(f"it could not be stored: {text.describe_error(error)}") from None
-
-    def _end_change(self, change: asyncio.Future[T]) -> None:
-        self._waiting -= 1
-        if not change.cancelled():
-            change.exception()  # the request may wait no longer
+        finally:
+            self._waiting -= 1
 
     def _read(self) -> None:
         """Follow the file, and store there when devices were seen."""

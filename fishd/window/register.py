@@ -4,6 +4,7 @@ Each window has a file in its state folder, which is locked while the window liv
 window` finds the window, and a later window learns which experiments were lost with an earlier one.
 """
 
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
@@ -25,7 +26,7 @@ from fishd.window.settings import WindowSettings
 MAX_FILE_BYTES = 2**20
 CLOSE_TIMEOUT_S = 1.0
 """Longest wait for the disk at the end [s]; a later window removes what stays."""
-_PATTERN = "window-*.json"
+_PATTERN, _SCRATCH_SUFFIX = "window-*.json", ".scratch"
 
 
 class RunningWindow(Struct, frozen=True):
@@ -48,15 +49,19 @@ class Register:
     def __init__(self, folder: Path) -> None:
         """folder: state folder, which exists"""
         self._path = folder / f"window-{getpid()}.json"
+        self.scratch = self._path.with_suffix(_SCRATCH_SUFFIX)
+        """Folder that is removed at the end, or with the next window if this one is killed."""
         self._stack = ExitStack()
         self._entry = RunningWindow("")
 
     def __enter__(self) -> "Register":
         try:
             self._stack.enter_context(locked(self._path, remove=True))
+            self.scratch.mkdir(mode=0o700, exist_ok=True)
         except (OSError, LockHeld) as error:
             raise StartupError(f"{lock_path(self._path)} cannot be locked: {error}") from None
         self._stack.callback(self._path.unlink, missing_ok=True)
+        self._stack.callback(shutil.rmtree, self.scratch, ignore_errors=True)
         # A disk may be slow, and an emergency stop must not wait for it.
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="register")
         return self
@@ -87,8 +92,11 @@ def find_running(folder: Path) -> list[RunningWindow]:
 
 
 def take_lost_jobs(folder: Path) -> list[msgspec.Raw]:
-    """Return the jobs of the windows that were killed, and remove their entries."""
+    """Return the jobs of the windows that were killed, and remove their entries and folders."""
     jobs = list[msgspec.Raw]()
+    for scratch in folder.glob(f"window-*{_SCRATCH_SUFFIX}"):
+        if not find_lock_holder(scratch.with_suffix(".json")):
+            shutil.rmtree(scratch, ignore_errors=True)
     for path, entry in _read_entries(folder):
         if not find_lock_holder(path):
             jobs += entry.jobs

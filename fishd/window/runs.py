@@ -15,7 +15,6 @@ from fishd.core import files, text
 from fishd.core.decoding import decoder
 from fishd.window.children import JobError, call
 from fishd.window.pictures import open_picture, open_run_picture
-from fishd.window.scratch import Scratch
 
 RUNS_AGE_S = 1.0
 """Longest age of a list of runs [s]."""
@@ -38,8 +37,8 @@ _decode_header: Callable[[bytes], Header] = decoder(Header)
 class Runs:
     """The runs of a folder; use it in one event loop."""
 
-    def __init__(self, folder: Path, scratch: Scratch) -> None:
-        """scratch: place for pictures of recordings"""
+    def __init__(self, folder: Path, scratch: Path) -> None:
+        """scratch: folder for pictures of recordings"""
         self.folder, self._scratch = folder, scratch
         self._list: tuple[float, Any] = (-RUNS_AGE_S, [])
         self._listing, self._plotting = asyncio.Lock(), asyncio.Lock()
@@ -92,14 +91,12 @@ class Runs:
         """Return the picture of a recording, which is drawn if there is none; raise `JobError`."""
         try:
             async with self._plotting:
-                await asyncio.to_thread(self._scratch.create)
-                cache = self._scratch.folder
-                picture = cache / f"{name}.png"
+                picture = self._scratch / f"{name}.png"
                 stamp = await asyncio.to_thread(_read_stamp, self.folder / f"{name}.mcap")
                 if stamp is None or stamp != self._drawn.get(name):
-                    where = (f"--folder={self.folder}", f"--to={cache}")
+                    where = (f"--folder={self.folder}", f"--to={self._scratch}")
                     words = ["plot", name, "--force", *where, "--json"]
-                    await call(words, self.folder, self._scratch.descriptor)
+                    await call(words, self.folder)
                     self._drawn[name] = stamp
                 return await asyncio.to_thread(open_picture, picture, f"the picture of {name}")
         except files.NoFile:

@@ -37,6 +37,7 @@ class WindowServer(WebServer):
         self._settings, self._register = settings, Register(settings.state_folder)
         self._jobs = Jobs(
             settings.runs_folder,
+            self._register.scratch,
             tell=lambda job: self._pages.tell_job(job),
             keep=lambda jobs: self._register.change(jobs=[Raw(encode(job)) for job in jobs]),
             show_folder=settings.runs is not None,

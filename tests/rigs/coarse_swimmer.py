@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from fishd.assembly import open_swimmer
 from fishd.config import Config, load
+from fishd.virtual.swimmer.kind import FreeSwimmer
 from fishd.virtual.swimmer.robot import Swimmer
 from rigs.documents import ROOT
 from rigs.processes import sets
@@ -27,4 +27,4 @@ def coarse(*overrides: str, file: Path = FILE) -> Config:
 
 
 def swimmer(*overrides: str) -> Swimmer:
-    return open_swimmer(coarse(*overrides))
+    return FreeSwimmer.open(coarse(*overrides))

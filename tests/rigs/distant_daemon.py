@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
 
-from common import half_open
 from fishd.core import addresses
+from rigs import half_open
 from rigs.processes import Daemon, reserve_port, sets
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from fishd.assembly import assemble
 from fishd.controllers import registry
+from fishd.core import robots
 from fishd.core.clock import VirtualClock
 from fishd.hardware.base import Robot
 from fishd.hardware.registry import FORCE_SENSORS, SERVOS
@@ -51,8 +52,8 @@ def fishctl(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def forget_drivers() -> None:
-    """Reload the drivers, plants and controllers of other packages."""
-    for plugins in (FORCE_SENSORS, SERVOS, PLANTS, registry._plugins):
+    """Reload the drivers, plants, robots and controllers of other packages."""
+    for plugins in (FORCE_SENSORS, SERVOS, PLANTS, robots.registry(), registry._plugins):
         plugins._found.clear()
         vars(plugins).pop("_offered", None)
 

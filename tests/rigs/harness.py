@@ -157,7 +157,7 @@ class Wrapped:
         self.read_error: Exception | None = None
         self.write_error: Exception | None = None
         self.release_error: Exception | None = None
-        self.suspect = ""
+        self.suspect: str | None = None
         self.fx: float | None = None
         self.fy: float | None = None
         """Value that replaces F_y in every measurement [N]; None: true values."""

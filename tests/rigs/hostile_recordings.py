@@ -14,7 +14,8 @@ import numpy as np
 import zstandard
 from mcap.opcode import Opcode
 
-from common.mcap_records import (
+from fishd.core.signals import Event
+from rigs.mcap_records import (
     MAGIC,
     Record,
     attachment,
@@ -27,7 +28,6 @@ from common.mcap_records import (
     split,
     text,
 )
-from fishd.core.signals import Event
 
 TICK, EVENT, STATUS, CAMERA = 1, 2, 3, 4
 """Numbers of the channels of `RunWriter`."""

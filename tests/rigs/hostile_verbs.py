@@ -10,9 +10,9 @@ from pathlib import Path
 
 import msgspec
 
-from common.mcap_records import split, write_good_recording
-from common.recording_verbs import Outcome, peak_memory, run_verb
 from rigs.hostile_recordings import FILES
+from rigs.mcap_records import split, write_good_recording
+from rigs.recording_verbs import Outcome, peak_memory, run_verb
 
 MAX_ADDRESSES = 4 * 2**30
 """Limit of the address space of the process [bytes]."""

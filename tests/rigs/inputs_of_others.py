@@ -11,7 +11,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 from msgspec.structs import replace
 
-from common.mcap_records import MAGIC, Record, join, split
+from rigs.mcap_records import MAGIC, Record, join, split
 from rigs.recordings import record_run, swum, write
 
 FILES: dict[str, Callable[[Path], bytes]] = {}

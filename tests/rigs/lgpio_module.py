@@ -6,8 +6,6 @@ rpi-lgpio's RPi.GPIO runs on it unchanged. Its error numbers, modes and checks a
 
 import os
 import sys
-import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Self
@@ -16,27 +14,21 @@ REVISION = "c03114"
 """Revision that rpi-lgpio reads: a Pi 4 B."""
 
 _KERNEL_OUTPUT = 2
-_EDGE_SHIFT = 17
 _ERRORS = {
     -5: "unknown handle",
-    -72: "bad event request",
     -73: "bad GPIO number",
     -78: "can not open gpiochip",
     -79: "GPIO busy",
     -80: "GPIO not allocated",
-    -98: "bad debounce microseconds",
     -102: "bad PWM frequency",
     -103: "bad PWM dutycycle",
 }
 LINES = 54
 """Number of GPIOs of the emulated chip."""
 
-INPUT, OUTPUT, ALERT = 0x100, 0x200, 0x400
-"""Modes of a claimed pin; ALERT is an input that reports its edges."""
+INPUT, OUTPUT = 0x100, 0x200
+"""Modes of a claimed pin."""
 PULL_UP, PULL_DOWN, PULL_NONE = 32, 64, 128
-
-EdgeFunction = Callable[[int, int, int, int], None]
-"""Function called with chip, GPIO, level and time."""
 
 
 @dataclass
@@ -45,9 +37,7 @@ class Line:
 
     mode: int = 0
     pull: int = PULL_NONE
-    edges: int = 0
     driven: int = 0
-    outside: int | None = None
     pwm: tuple[float, float] | None = None
     """Frequency [Hz] and duty cycle [%]."""
     busy: bool = False
@@ -62,8 +52,6 @@ class Line:
         """Return the level, from the side that drives the pin."""
         if self.is_output:
             return self.driven
-        if self.outside is not None:
-            return self.outside
         return int(self.pull == PULL_UP)
 
 
@@ -72,43 +60,8 @@ class Pins:
 
     def __init__(self) -> None:
         self.lines = [Line() for _ in range(LINES)]
-        self.callbacks: list[Callback] = []
         self.present = True
         """Whether the GPIO chip exists."""
-        self.reports_edges = True
-        """Whether edges can be reported; false as with old libraries on kernels from 6.6 on."""
-
-    def set_level(self, gpio: int, level: int | None) -> None:
-        """Drive a pin from outside, as a button does; None stops driving it.
-
-        Returns after the callbacks of its edges, which run in a separate thread.
-        """
-        line = self.lines[gpio]
-        before = line.level()
-        line.outside = level
-        after = line.level()
-        edge = 1 if after > before else 2 if after < before else 0
-        if not (line.mode & ALERT and line.edges & edge):
-            return
-        for callback in [item for item in self.callbacks if item.gpio == gpio]:
-            thread = threading.Thread(target=callback.function, args=(0, gpio, after, 0))
-            thread.start()
-            thread.join()
-
-
-class Callback:
-    """Registered callback, like the object that lgpio.callback returns."""
-
-    def __init__(self, pins: Pins, gpio: int, function: EdgeFunction) -> None:
-        self.gpio = gpio
-        self.function = function
-        self._pins = pins
-        pins.callbacks.append(self)
-
-    def cancel(self) -> None:
-        """Stop the reports of the pin's edges."""
-        if self in self._pins.callbacks:
-            self._pins.callbacks.remove(self)
 
 
 class Error(Exception):
@@ -176,7 +129,7 @@ class _Lgpio(ModuleType):
     def gpio_get_mode(self, handle: int, gpio: int) -> int:
         line = self._line(handle, gpio)
         kernel_flag = _KERNEL_OUTPUT if line.is_output else 0
-        return line.mode | kernel_flag | line.pull | line.edges << _EDGE_SHIFT
+        return line.mode | kernel_flag | line.pull
 
     def gpio_claim_input(self, handle: int, gpio: int, flags: int = 0) -> int:
         self._claim(self._line(handle, gpio), INPUT).pull = flags
@@ -187,13 +140,6 @@ class _Lgpio(ModuleType):
         if not line.is_output:  # an existing output keeps its level
             self._claim(line, OUTPUT).pull = flags
             line.driven = int(bool(level))
-        return 0
-
-    def gpio_claim_alert(self, handle: int, gpio: int, edges: int, flags: int = 0) -> int:
-        if not self._pins.reports_edges:
-            raise Error(-72)
-        line = self._claim(self._line(handle, gpio), ALERT)
-        line.pull, line.edges = flags, edges
         return 0
 
     def gpio_free(self, handle: int, gpio: int) -> int:
@@ -216,12 +162,6 @@ class _Lgpio(ModuleType):
         line.driven = int(bool(level))
         return 0
 
-    def gpio_set_debounce_micros(self, handle: int, gpio: int, micros: int) -> int:
-        self._line(handle, gpio)
-        if not 0 <= micros <= 5_000_000:
-            raise Error(-98)
-        return 0
-
     def tx_pwm(self, handle: int, gpio: int, frequency: float, duty_cycle: float) -> int:
         line = self._line(handle, gpio)
         if frequency == 0.0:
@@ -235,9 +175,6 @@ class _Lgpio(ModuleType):
             self._claim(line, OUTPUT)
         line.pwm = (frequency, duty_cycle)
         return 9  # free entries in its queue
-
-    def callback(self, _handle: int, gpio: int, func: EdgeFunction) -> Callback:
-        return Callback(self._pins, gpio, func)
 
     def _line(self, handle: int, gpio: int) -> Line:
         if handle != 0 or not self._open:
@@ -255,7 +192,7 @@ class _Lgpio(ModuleType):
 
     @staticmethod
     def _free(line: Line) -> None:
-        line.mode, line.pull, line.edges, line.pwm = 0, PULL_NONE, 0, None
+        line.mode, line.pull, line.pwm = 0, PULL_NONE, None
 
 
 def _forget_modules() -> dict[str, ModuleType]:

@@ -16,13 +16,15 @@ from fishd.controllers.policy.card import (
     Card,
     Feature,
     FeatureName,
+    History,
     Provenance,
     StackSettings,
     encode,
 )
-from fishd.controllers.policy.checksum import seal
+from fishd.controllers.policy.file import seal
 from fishd.controllers.policy.network import Layer, Sight, to_onnx
 from fishd.core.errors import PolicyError
+from fishd.core.signals import Observation
 
 PROVENANCE = Provenance(
     created="2026-11-21T07:00:00+00:00",
@@ -47,6 +49,13 @@ def card(*features: tuple[FeatureName, float], tick: float = 0.05, amplitude: fl
         amplitude=amplitude,
         provenance=PROVENANCE,
     )
+
+
+def vector(features: Sequence[Feature], observation: Observation) -> NDArray[np.float32]:
+    """Return the input of a network without a history."""
+    history = History(tuple(features))
+    history.push(observation)
+    return history.row
 
 
 def linear(*weights: float, bias: float = 0.0) -> list[Layer]:

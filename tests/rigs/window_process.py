@@ -195,9 +195,10 @@ async def open_page(browser: Browser, fish: str = "fish", client: str = "") -> A
         yield page
 
 
-def run(test: Coroutine[Any, Any, None]) -> None:
-    """Run a test within a generous time."""
-    asyncio.run(_end_in_time(test))
+async def wait_until_live(window: WindowProcess) -> None:
+    """Wait until a window hears its fish."""
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        await page.until("ticks")
 
 
 def run_apart(task: Coroutine[Any, Any, None]) -> None:

@@ -122,7 +122,7 @@ def test_an_import_that_did_not_end_in_time_is_tried_again(
     assert trial_import.find_danger("delayed") == "its import does not end within 0.5 s"
     file.write_text("delayed = True\n")
     monkeypatch.setattr(trial_import, "TIMEOUT_S", PATIENCE)
-    assert trial_import.find_danger("delayed") == ""
+    assert trial_import.find_danger("delayed") is None
 
 
 def test_every_signal_that_ends_an_import_is_named(

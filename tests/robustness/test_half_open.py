@@ -14,8 +14,10 @@ from typing import Any, NamedTuple
 
 import pytest
 import zmq
+from rigs import half_open
 from rigs.camera_process import COMMAND
 from rigs.distant_daemon import DistantDaemon, running_at_a_distance
+from rigs.half_open import HOST, PATH_HOST
 from rigs.processes import (
     FISHCTL,
     PATIENCE,
@@ -27,8 +29,6 @@ from rigs.processes import (
     wait_until,
 )
 
-from common import half_open
-from common.half_open import HOST, PATH_HOST
 from fishd.camera.requests import CameraLost, CameraRequests
 from fishd.cli.recording.record import INCOMPLETE
 from fishd.client import AsyncFish, Fish, NoDaemon

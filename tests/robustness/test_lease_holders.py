@@ -94,7 +94,7 @@ def test_a_second_verb_is_refused_unless_it_takes_the_fish(daemon: Daemon) -> No
 
 
 @pytest.mark.realtime
-def test_asyncio_programs_hold_the_fish_too(daemon: Daemon) -> None:
+async def test_asyncio_programs_hold_the_fish_too(daemon: Daemon) -> None:
     async def lose(fish: AsyncFish) -> None:
         async with fish.lease("a page", seconds=0.5):
             async with AsyncFish(daemon.endpoint, timeout=PATIENCE) as intruder:
@@ -102,20 +102,17 @@ def test_asyncio_programs_hold_the_fish_too(daemon: Daemon) -> None:
             async for _ in fish.ticks():
                 pass
 
-    async def story() -> None:
-        async with AsyncFish(daemon.endpoint, timeout=PATIENCE) as fish:
-            async with fish.lease("a page", seconds=0.5):
-                await fish.set_controller("swing")
-                await asyncio.sleep(1.5)
-                status = await fish.status()
-                assert status.lease
-                assert (status.mode, status.lease.name) == ("running", "a page")
-            assert (await fish.status()).mode == "idle"
-            with pytest.raises(LeaseLost, match="sine was set by hand"):
-                await lose(fish)
-            assert (await fish.status()).controller == "sine"
-
-    asyncio.run(story())
+    async with AsyncFish(daemon.endpoint, timeout=PATIENCE) as fish:
+        async with fish.lease("a page", seconds=0.5):
+            await fish.set_controller("swing")
+            await asyncio.sleep(1.5)
+            status = await fish.status()
+            assert status.lease
+            assert (status.mode, status.lease.name) == ("running", "a page")
+        assert (await fish.status()).mode == "idle"
+        with pytest.raises(LeaseLost, match="sine was set by hand"):
+            await lose(fish)
+        assert (await fish.status()).controller == "sine"
 
 
 @pytest.mark.parametrize(("ended_by", "lines"), [(KeyboardInterrupt, 1), (NoDaemon, 0)])

@@ -7,7 +7,7 @@ import pytest
 from onnx import helper
 from rigs.policy_files import FLIP, card, random_layers, refusal
 
-from fishd.controllers.policy import checksum, file, library
+from fishd.controllers.policy import file, library
 from fishd.controllers.policy.file import parse
 from fishd.controllers.policy.network import to_onnx
 from fishd.core.errors import PolicyError
@@ -35,26 +35,26 @@ def test_a_weight_that_is_another_number_is_called_damage() -> None:
     damaged = content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
     assert refusal(damaged) == (
         "it is damaged: its content does not match its checksum; copy it again; in a program that "
-        "changes it, call fishd.controllers.policy.checksum.seal as the last step"
+        "changes it, call fishd.controllers.policy.file.seal as the last step"
     )
 
 
 def test_a_file_without_a_checksum_or_with_two_is_refused() -> None:
     model = onnx.load_model_from_string(FLIP)
     entries = {entry.key: entry.value for entry in model.metadata_props}
-    digest = entries.pop(checksum.CHECKSUM_KEY)
+    digest = entries.pop(file.CHECKSUM_KEY)
     helper.set_model_props(model, entries)
     assert refusal(model.SerializeToString()).startswith("its metadata lacks fishd.sha256, ")
     for value in ("0" * 64, digest, "", "none"):
-        model.metadata_props.add(key=checksum.CHECKSUM_KEY, value=value)
+        model.metadata_props.add(key=file.CHECKSUM_KEY, value=value)
         assert refusal(model.SerializeToString()).startswith("it is damaged: ")
 
 
 def test_a_model_that_is_sealed_again_is_whole() -> None:
     model = onnx.load_model_from_string(FLIP)
-    assert checksum.seal(model) == FLIP
+    assert file.seal(model) == FLIP
     model.doc_string = "by another tool"
-    assert file.parse(checksum.seal(model)) == card()
+    assert file.parse(file.seal(model)) == card()
 
 
 @pytest.mark.parametrize("content", [b"\x0a\x05abc", b"\x0b", b"\xff" * 11, b"\x09abc"])

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 from rigs.processes import FISHCTL, Daemon, Process, running, wait_until
+from rigs.small_disk import Disk, NoDisk, small_disk
 
-from common.small_disk import Disk, NoDisk, small_disk
 from fishd.core.errors import RecordingError
 from fishd.recording import open_run
 

@@ -64,11 +64,7 @@ def test_a_refusal_carries_its_code(daemon: Daemon) -> None:
         assert fish.status().mode == "idle"
 
 
-def test_nobody_at_the_endpoint_is_told_apart_from_a_refusal(tmp_path: Path) -> None:
-    async def call() -> None:
-        async with AsyncFish("tcp://127.0.0.1:9", timeout=0.05) as fish:
-            await fish.status()
-
+async def test_nobody_at_the_endpoint_is_told_apart_from_a_refusal(tmp_path: Path) -> None:
     nobody = Fish(f"ipc://{tmp_path}/nobody")
     with nobody as fish, pytest.raises(NoDaemon, match="no process listens"):
         fish.status()
@@ -76,7 +72,8 @@ def test_nobody_at_the_endpoint_is_told_apart_from_a_refusal(tmp_path: Path) -> 
     with Fish("tcp://127.0.0.1:9", timeout=0.05) as fish, pytest.raises(NoDaemon, match=silence):
         fish.status()
     with pytest.raises(NoDaemon, match=silence):
-        asyncio.run(call())
+        async with AsyncFish("tcp://127.0.0.1:9", timeout=0.05) as fish:
+            await fish.status()
 
 
 def test_telemetry_that_ends_is_noticed(own_daemon: Daemon) -> None:
@@ -88,27 +85,24 @@ def test_telemetry_that_ends_is_noticed(own_daemon: Daemon) -> None:
             list(ticks)
 
 
-def test_asyncio_programs_get_the_same(daemon: Daemon) -> None:
-    async def swim() -> None:
-        async with AsyncFish(daemon.endpoint, timeout=PATIENCE) as fish:
-            assert (await fish.set_controller("swing", C=0.5)).controller == "swing"
-            assert (await fish.set_parameters(C=0.7)).parameters["C"] == 0.7
-            seen = []
-            async for tick in fish.ticks():
-                seen.append(tick.seq)
-                if len(seen) == 5:
-                    break
-            assert seen == list(range(seen[0], seen[0] + 5))
-            assert (await fish.status()).controller == "swing"
-            assert "hold" in [info.name for info in await fish.controllers()]
-            with pytest.raises(Refused, match="did you mean 'swing'"):
-                await fish.set_controller("swung")
-            assert (await fish.estop()).mode == "estop"
-            assert (await fish.clear_fault()).mode == "idle"
-            assert (await fish.mark("done")).mode == "idle"
-            assert (await fish.stop()).mode == "idle"
-
-    asyncio.run(swim())
+async def test_asyncio_programs_get_the_same(daemon: Daemon) -> None:
+    async with AsyncFish(daemon.endpoint, timeout=PATIENCE) as fish:
+        assert (await fish.set_controller("swing", C=0.5)).controller == "swing"
+        assert (await fish.set_parameters(C=0.7)).parameters["C"] == 0.7
+        seen = []
+        async for tick in fish.ticks():
+            seen.append(tick.seq)
+            if len(seen) == 5:
+                break
+        assert seen == list(range(seen[0], seen[0] + 5))
+        assert (await fish.status()).controller == "swing"
+        assert "hold" in [info.name for info in await fish.controllers()]
+        with pytest.raises(Refused, match="did you mean 'swing'"):
+            await fish.set_controller("swung")
+        assert (await fish.estop()).mode == "estop"
+        assert (await fish.clear_fault()).mode == "idle"
+        assert (await fish.mark("done")).mode == "idle"
+        assert (await fish.stop()).mode == "idle"
 
 
 def test_text_that_is_not_utf8_is_refused_but_never_stops_an_emergency_stop() -> None:
@@ -148,19 +142,16 @@ def test_a_command_whose_gateway_is_gone_fails_at_once_and_is_not_repeated(tmp_p
     assert operations == ["mark", "status"]
 
 
-def test_an_asyncio_client_closes_while_a_request_has_no_answer(tmp_path: Path) -> None:
+async def test_an_asyncio_client_closes_while_a_request_has_no_answer(tmp_path: Path) -> None:
     """The request ends with an error, not after its timeout."""
     endpoint = f"ipc://{tmp_path}/control"
 
-    async def close_early() -> None:
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as silent:
+        silent.linger = 0
+        silent.bind(endpoint)
         fish = AsyncFish(endpoint, timeout=1e6)
         request = asyncio.create_task(fish.status())
         assert await asyncio.to_thread(silent.poll, PATIENCE * 1e3)
         fish.close()
         with pytest.raises(FishError, match="the client was closed during a request"):
             await request
-
-    with zmq.Context() as context, context.socket(zmq.ROUTER) as silent:
-        silent.linger = 0
-        silent.bind(endpoint)
-        asyncio.run(close_early())

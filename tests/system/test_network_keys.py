@@ -28,7 +28,7 @@ from rigs.processes import (
     sets,
     wait_until,
 )
-from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
+from rigs.window_process import Browser, WindowProcess, open_page, running_window
 
 from fishd.client import Fish, Refused
 from fishd.client.zmq_sockets import connect_subscriber
@@ -286,22 +286,19 @@ def test_sockets_of_this_machine_need_no_key(keyed: KeyedDaemon) -> None:
         assert subscriber.until(mode="idle")
 
 
-def test_a_window_recovers_once_its_removed_key_is_known_again(
+async def test_a_window_recovers_once_its_removed_key_is_known_again(
     keyed: KeyedDaemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def watch(url: str) -> None:
-        async with Browser(url) as browser, open_page(browser) as page:
+    keyed.add("watch", "stranger")
+    monkeypatch.setenv("FISHD_KEYS", str(keyed.folder / "stranger"))
+    with running_window(tmp_path, fish=keyed.endpoint) as window:
+        async with Browser(window.url) as browser, open_page(browser) as page:
             await page.until("ticks")
             keyed.remove("stranger")
             lost = await page.until("connection", lambda link: link["state"] == "lost")
             assert "known to" in lost["message"]
             keyed.add("watch", "stranger")
             await page.until("connection", lambda link: link["state"] == "live")
-
-    keyed.add("watch", "stranger")
-    monkeypatch.setenv("FISHD_KEYS", str(keyed.folder / "stranger"))
-    with running_window(tmp_path, fish=keyed.endpoint) as window:
-        run(watch(window.url))
     keyed.remove("stranger")
 
 
@@ -317,16 +314,13 @@ def test_verbs_that_follow_telemetry_work_with_a_key(keyed: KeyedDaemon, tmp_pat
     assert (tmp_path / "a.mcap").exists()
 
 
-def test_the_window_works_with_a_key(
+async def test_the_window_works_with_a_key(
     keyed: KeyedDaemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def swim(url: str) -> None:
-        async with Browser(url) as browser, open_page(browser) as page:
-            await page.swim()
-
     monkeypatch.setenv("FISHD_KEYS", str(keyed.folder / "driver"))
     with running_window(tmp_path, fish=keyed.endpoint) as window:
-        run(swim(window.url))
+        async with Browser(window.url) as browser, open_page(browser) as page:
+            await page.swim()
 
 
 def test_keys_made_with_fishctl_connect_two_that_add_the_printed_lines(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def heads_in(folder: Path) -> list[FrameHead]:
 
 
 def recording(daemon: Daemon, camera: CameraProcess) -> Process:
-    words = ("--endpoint", daemon.endpoint, "camera", "record", "run")
+    words = ("--endpoint", daemon.endpoint, "record", "run")
     return Process(FISHCTL, *words, "--camera", camera.endpoint)
 
 

@@ -1,6 +1,6 @@
 """True fishd and fishctl on a unix clock that is set while they run, or is wrong from the start.
 
-The clock is that of `common.wall_clock`: the clock of this machine is not touched.
+The clock is that of `rigs.wall_clock`: the clock of this machine is not touched.
 """
 
 import json
@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 from rigs.processes import FISHCTL, Process, call, wait_until
+from rigs.wall_clock import WallClock
 
 from common.daemon import Fishd
-from common.wall_clock import WallClock
 from fishd.client import Fish
 from fishd.core.errors import RecordingError
 from fishd.recording import open_run

@@ -7,18 +7,7 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # tools/
 
 from common.report import run  # noqa: E402
 
-NAMES = (
-    "tick",
-    "swims",
-    "coverage",
-    "identification",
-    "adapt",
-    "optimise",
-    "learning",
-    "swimmer",
-    "window",
-    "accuracy",
-)
+NAMES = ("tick", "accuracy")
 
 if __name__ == "__main__":
     sys.exit(run("bench", NAMES))

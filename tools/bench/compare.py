@@ -11,60 +11,20 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from msgspec import Struct
 
 from common.daemon import TIMEOUT_S, Fishd
-from common.machine import machine_in_short, priorities, scheduling
+from common.machine import priorities, scheduling
 from common.report import Report, progress, quantile, table
 
 SETTLE = 2.0
 """Time that a fishd ticks before it is measured [s]."""
 VIRTUAL_SECONDS = 300.0
-RESAMPLES = 10_000
-Quantity = tuple[str, str, Callable[["Turn"], float]]
-
-
-class Turn(Struct, frozen=True):
-    """Results of one checkout in one turn."""
-
-    start_up: float
-    """Time from the start of the process to its READY=1 [ms]."""
-    start_up_cpu: float
-    """Processor time of all its processes until READY=1 [ms]."""
-    lateness: list[float]
-    """Lateness of each tick [µs]."""
-    busy: list[float]
-    """Time of each tick until its record was sealed [µs]."""
-    cpu: float
-    """Processor time of all its processes per tick [µs]."""
-    memory: float
-    """Memory of the main process of fishd, at rest [MB]."""
-    total_memory: float
-    """Memory including its gateways, with shared pages counted once [MB]."""
-    virtual: float
-    """Time per tick of `fishctl simulate` [µs]."""
-    virtual_cpu: float
-    """Processor time of a run of `fishctl simulate` [ms]."""
-
-
-# Larger is worse for each.
-QUANTITIES: list[Quantity] = [
-    ("lateness p50", "µs", lambda turn: quantile(turn.lateness, 0.5)),
-    ("lateness p99", "µs", lambda turn: quantile(turn.lateness, 0.99)),
-    ("busy time per tick, p50", "µs", lambda turn: quantile(turn.busy, 0.5)),
-    ("busy time per tick, p99", "µs", lambda turn: quantile(turn.busy, 0.99)),
-    ("CPU per tick, all processes", "µs", lambda turn: turn.cpu),
-    ("RSS at rest", "MB", lambda turn: turn.memory),
-    ("PSS at rest, with gateways", "MB", lambda turn: turn.total_memory),
-    ("start-up until READY=1", "ms", lambda turn: turn.start_up),
-    ("start-up, processor time", "ms", lambda turn: turn.start_up_cpu),
-    ("virtual time, per tick", "µs", lambda turn: turn.virtual),
-    (f"{VIRTUAL_SECONDS:g} s of virtual time, processor time", "ms", lambda turn: turn.virtual_cpu),
-]
+Turn = dict[str, float]
+"""Results of one checkout in one turn: quantities with their units, larger is worse for each."""
 
 
 def compare(checkout: Path, seconds: float, rounds: int) -> Report:
@@ -84,13 +44,13 @@ def compare(checkout: Path, seconds: float, rounds: int) -> Report:
         order = sides if number % 2 else sides[::-1]
         turn_by_side = {side: take_turn(side, seconds) for side in order}
         turns.append((turn_by_side[sides[0]], turn_by_side[sides[1]]))
-        progress(f"round {number + 1} of {rounds}", *_row(QUANTITIES[1], turns)[:4])
+        progress(f"round {number + 1} of {rounds}", *_row("lateness p99 [µs]", turns)[:4])
     head = "quantity | before | after | after / before | 95 % interval | worse"
     text = (
         f"Before: {sides[0].parent}. After: {sides[1].parent}. Medians of {rounds} rounds in "
         f"turns; {seconds:g} s of 50 ms ticks each, {scheduling(priorities()[-1])} scheduling; "
-        f"interval of the median ratio by bootstrap over rounds. {machine_in_short()}\n\n"
-        f"{table(head, [_row(quantity, turns) for quantity in QUANTITIES])}"
+        f"interval of the median ratio by bootstrap over rounds.\n\n"
+        f"{table(head, [_row(quantity, turns) for quantity in turns[0][0]])}"
     )
     return Report({"bench tick against": text}, turns)
 
@@ -116,18 +76,21 @@ def take_turn(bin_folder: Path, seconds: float) -> Turn:
             ticks = [json.loads(message) for message in fishd.waiting_messages()]
             memory, total = fishd.memory(), fishd.total_memory()
     virtual, virtual_cpu = virtual_time(bin_folder)
-    busy_time = "busy_time_us" if "busy_time_us" in ticks[0] else "busy_us"  # before protocol 2
-    return Turn(
-        start_up=start_up * 1e3,
-        start_up_cpu=start_up_cpu * 1e3,
-        lateness=[tick["lateness_us"] for tick in ticks],
-        busy=[tick[busy_time] for tick in ticks],
-        cpu=cpu / len(ticks) * 1e6,
-        memory=memory,
-        total_memory=total,
-        virtual=virtual,
-        virtual_cpu=virtual_cpu * 1e3,
-    )
+    lateness = [tick["lateness_us"] for tick in ticks]
+    busy = [tick["busy_time_us"] for tick in ticks]  # until the record is sealed
+    return {
+        "lateness p50 [µs]": quantile(lateness, 0.5),
+        "lateness p99 [µs]": quantile(lateness, 0.99),
+        "busy time per tick, p50 [µs]": quantile(busy, 0.5),
+        "busy time per tick, p99 [µs]": quantile(busy, 0.99),
+        "CPU per tick, all processes [µs]": cpu / len(ticks) * 1e6,
+        "RSS at rest [MB]": memory,
+        "PSS at rest, with gateways [MB]": total,
+        "start-up until READY=1 [ms]": start_up * 1e3,
+        "start-up, processor time [ms]": start_up_cpu * 1e3,
+        "virtual time, per tick [µs]": virtual,
+        f"{VIRTUAL_SECONDS:g} s of virtual time, processor time [ms]": virtual_cpu * 1e3,
+    }
 
 
 def virtual_time(bin_folder: Path) -> tuple[float, float]:
@@ -144,19 +107,18 @@ def virtual_time(bin_folder: Path) -> tuple[float, float]:
 def interval(ratios: Sequence[float]) -> tuple[float, float]:
     """Return the 95 % confidence interval of the median of ratios."""
     draw = np.random.default_rng(0)
-    medians = np.median(draw.choice(ratios, (RESAMPLES, len(ratios))), axis=1)
+    medians = np.median(draw.choice(ratios, (10_000, len(ratios))), axis=1)
     low, high = np.percentile(medians, (2.5, 97.5))
     return float(low), float(high)
 
 
-def _row(quantity: Quantity, turns: list[tuple[Turn, Turn]]) -> list[str]:
-    name, unit, figure = quantity
-    before, after = ([figure(turn) for turn in side] for side in zip(*turns, strict=True))
+def _row(quantity: str, turns: list[tuple[Turn, Turn]]) -> list[str]:
+    before, after = ([turn[quantity] for turn in side] for side in zip(*turns, strict=True))
     ratios = [new / old for old, new in zip(before, after, strict=True)]
     low, high = interval(ratios)
     return [
-        name,
-        *(f"{statistics.median(side):.4g} {unit}" for side in (before, after)),
+        quantity,
+        *(f"{statistics.median(side):.4g}" for side in (before, after)),
         f"{statistics.median(ratios):.3f}",
         f"{low:.3f} – {high:.3f}",
         "**yes**" if low > 1.0 else "no" if high < 1.0 else "not shown",

@@ -1,6 +1,6 @@
-"""Punctuality, speed and size of fishd, compared with other loops on the same busy machine.
+"""Punctuality, speed and size of fishd, compared with cyclictest on the same busy machine.
 
-Machines are noisy, so compare ratios: all contestants run at the same time, under the same load.
+Machines are noisy, so compare ratios: both run at the same time, under the same load.
 Everything stays on this machine and stops by itself.
 
 With --against, two checkouts of fishd are compared instead, in turns.
@@ -19,7 +19,7 @@ import msgspec
 from msgspec import Struct
 
 from bench.compare import compare
-from bench.contestants import Lateness, lateness, start_all
+from bench.cyclictest import Cyclictest, Lateness, lateness
 from common.daemon import Fishd
 from common.machine import load, machine, priorities, scheduling, stress
 from common.processes import BIN
@@ -44,12 +44,10 @@ class Figures(Struct, frozen=True):
     """Fraction of one core."""
     rss: float
     """Resident memory at the end [MB]."""
-    peak: float
-    """Peak resident memory [MB]."""
 
 
 class Round(Struct, frozen=True):
-    """Results of all contestants at the same time; fishd is the first of `lateness`."""
+    """Results of both at the same time; fishd is the first of `lateness`."""
 
     stressed: bool
     priority: int
@@ -82,14 +80,13 @@ class Results(Struct, frozen=True):
 
 
 def run_round(stressed: bool, priority: int, tick: float, seconds: float) -> Round:
-    """Run fishd and all other contestants for `seconds`."""
+    """Run fishd and cyclictest for `seconds`."""
     with ExitStack() as stack:
         fishd = stack.enter_context(Fishd(f"tick={tick}", f"realtime.priority={priority}"))
         fishd.next_tick()
         time.sleep(1.0)
-        others = start_all(tick, seconds, priority)
-        for other in others:
-            stack.callback(other.kill)
+        other = Cyclictest(tick, seconds, priority)
+        stack.callback(other.kill)
         fishd.waiting_ticks()
         start, cpu = time.monotonic(), fishd.cpu_seconds()
         time.sleep(seconds)
@@ -106,10 +103,8 @@ def run_round(stressed: bool, priority: int, tick: float, seconds: float) -> Rou
             timing=fishd.status().timing,
             cpu=cpu,
             rss=fishd.memory(),
-            peak=fishd.memory("VmHWM"),
         )
-        everyone = [itself, *(other.result() for other in others)]
-        return Round(stressed, priority, tick, everyone, figures)
+        return Round(stressed, priority, tick, [itself, *other.results()], figures)
 
 
 def measure_latency(stressed: bool, priority: int, runs: int) -> Latency:

@@ -40,13 +40,6 @@ def machine() -> dict[str, str]:
     }
 
 
-def machine_in_short() -> str:
-    """Return the properties of the machine in one sentence."""
-    about = machine()
-    cores, python, fifo = (about[key] for key in ("Cores", "Python", "SCHED_FIFO"))
-    return f"{about['CPU']}, {cores} cores; Python {python}; SCHED_FIFO: {fifo}."
-
-
 @cache
 def fifo_permitted() -> bool:
     """Return whether child processes may use real-time scheduling."""

@@ -2,29 +2,22 @@
 
 import argparse
 import ast
-import csv
 import importlib
 import os
-import statistics
 import sys
-import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import msgspec
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-ERRORS = DOCS / "figures" / "accuracy.csv"
-"""Errors of all results that have an interval, which the benches keep; see `Report.errors`."""
 Options = dict[str, dict[str, Any]]
 """Options of a command line: arguments of `ArgumentParser.add_argument`, by name."""
 JOBS: Options = {"--jobs": {"type": int, "default": os.cpu_count(), "help": "number of processes"}}
 """Option of a measurement that runs its cases in parallel."""
-QUICK: Options = {"--quick": {"action": "store_true", "help": "few short cases, as a trial"}}
 
 
 class Report(NamedTuple):
@@ -39,8 +32,6 @@ class Report(NamedTuple):
     number: str = ""
     """The result in one line, for a cell of a table in docs/; it is written instead of the only
     section, which is for people."""
-    errors: Mapping[str, list[float]] = MappingProxyType({})
-    """Errors of results with an interval, by kind of result [half-widths of their intervals]."""
 
 
 class BrokenPromise(BaseException):
@@ -50,8 +41,8 @@ class BrokenPromise(BaseException):
 def run(package: str, names: Sequence[str]) -> int:
     """Run the measurement of the command line, and return the exit status.
 
-    package: folder below tools/; each of `names` is a module in it with `OPTIONS`, and either
-    `measure(options) -> Report` or several such functions by name in `PARTS`
+    package: folder below tools/; each of `names` is a module in it with `OPTIONS` and
+    `measure(options) -> Report`
     """
     parser = argparse.ArgumentParser(prog=f"tools/{package}")
     commands = parser.add_subparsers(dest="name", metavar="NAME", required=True)
@@ -65,57 +56,23 @@ def run(package: str, names: Sequence[str]) -> int:
         )
         if name in sys.argv[1:2]:  # other modules may need extras that are not installed
             module = importlib.import_module(f"{package}.{name}")
-            if parts := getattr(module, "PARTS", None):
-                command.add_argument("part", choices=(*parts, "all"))
             for option, settings in module.OPTIONS.items():
                 command.add_argument(option, **settings)
             command.add_argument("--json", action="store_true", help="print all figures as JSON")
             command.add_argument("--write", action="store_true", help="put the result into docs/")
     options = parser.parse_args()
     try:
-        reports = _measure_parts(parts, options) if parts else [module.measure(options)]
+        report = module.measure(options)
     except BrokenPromise as broken:
         print(f"{package} {options.name}: BROKEN: {broken}", file=sys.stderr)
         return 1
-    for report in reports:
-        text = "\n\n".join(report.sections.values())
-        print(msgspec.json.encode(report.figures).decode() if options.json else text)
-        if options.write:
-            for marker, section in report.sections.items():
-                if page := _page_with(marker):
-                    number = report.number
-                    put(page, marker, number or section, in_line=bool(number))
-            if report.errors:
-                _write_errors({**read_errors(), **report.errors})
-    return int(any(report.broken for report in reports))
-
-
-def _measure_parts(
-    parts: dict[str, Callable[[argparse.Namespace], Report]], options: argparse.Namespace
-) -> list[Report]:
-    """Return the result of each requested part."""
-    reports = []
-    for name in parts if options.part == "all" else (options.part,):
-        start = time.perf_counter()
-        reports.append(parts[name](options))
-        progress(name, f"{time.perf_counter() - start:.0f} s")
-    return reports
-
-
-def read_errors() -> dict[str, list[float]]:
-    """Return the errors that benches have kept, by kind of result [half-widths]."""
-    errors: dict[str, list[float]] = {}
-    if ERRORS.exists():
-        with ERRORS.open(encoding="utf-8", newline="") as file:
-            for kind, error in csv.reader(file):
-                errors.setdefault(kind, []).append(float(error))
-    return errors
-
-
-def _write_errors(errors: dict[str, list[float]]) -> None:
-    with ERRORS.open("w", encoding="utf-8", newline="") as file:
-        rows = ((kind, f"{error:.3f}") for kind, values in errors.items() for error in values)
-        csv.writer(file, lineterminator="\n").writerows(rows)
+    text = "\n\n".join(report.sections.values())
+    print(msgspec.json.encode(report.figures).decode() if options.json else text)
+    if options.write:
+        for marker, section in report.sections.items():
+            if page := _page_with(marker):
+                put(page, marker, report.number or section, in_line=bool(report.number))
+    return int(report.broken)
 
 
 def run_cases(function: Callable[[Any], Any], cases: Iterable[Any], jobs: int | None) -> list[Any]:
@@ -201,14 +158,6 @@ def _parted(document: Path, name: str) -> tuple[str, str, str]:
 def quantile(values: Sequence[float], share: float) -> float:
     """Return the value that a fraction `share` of all values does not exceed."""
     return sorted(values)[min(len(values) - 1, int(share * len(values)))]
-
-
-def spread(values: Sequence[float], factor: float = 100.0, digits: int = 1) -> str:
-    """Format the median, and the range in brackets; in per cent unless `factor` differs."""
-    middle, low, high = (
-        f"{factor * function(values):.{digits}f}" for function in (statistics.median, min, max)
-    )
-    return f"{middle} [{low} – {high}]"
 
 
 def percent(share: float) -> str:

@@ -19,10 +19,10 @@ from common.report import progress
 from fishd.config import Config, load
 from fishd.lab import drawing
 from fishd.lab.drawing import BLACK, BLUE, GREEN, ORANGE, PURPLE
-from fishd.lab.sweep.grid import Point
-from fishd.lab.sweep.measuring import Lengths, swim_freely
+from fishd.lab.sweep.grid import Lengths, Point
 from fishd.lab.sweep.results import SpeedResult
 from fishd.lab.swimmer.refinement import GridSpeed, estimate
+from fishd.lab.swimmer.speed import swim_freely
 from paper.runs import FOLDER, Row, column, read, write
 
 NAME = "figure-6"

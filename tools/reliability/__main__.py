@@ -7,23 +7,7 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # tools/
 
 from common.report import run  # noqa: E402
 
-NAMES = (
-    "clock_steps",
-    "deaths",
-    "deb",
-    "disks",
-    "half_open",
-    "kills",
-    "misbehaviour",
-    "mutations",
-    "odd_conditions",
-    "reach",
-    "soak",
-    "systemd",
-    "window",
-    "window_estop",
-    "window_kills",
-)
+NAMES = ("deaths", "deb", "kills", "misbehaviour", "soak", "systemd")
 
 if __name__ == "__main__":
     sys.exit(run("reliability", NAMES))

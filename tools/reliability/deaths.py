@@ -12,10 +12,10 @@ import time
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
-from threading import Barrier, Lock
+from threading import Barrier
 
 from msgspec import Struct
 
@@ -23,9 +23,8 @@ from common.daemon import START, TIMEOUT_S, Fishd, virtual_pi
 from common.report import Options, Report, progress, table
 from fishd.client import Fish, NoDaemon
 from fishd.virtual.pi.virtual_pi import VirtualPi
+from reliability.kills import GPIO, NEUTRAL, Lane
 
-GPIO = 18
-NEUTRAL = 1500.0
 WATCHED = 1.8
 """Time that the pulses are observed after the failure [s]."""
 
@@ -40,9 +39,6 @@ def sabotage(*_):
 signal.signal(signal.SIGUSR1, sabotage)
 fishd.daemon.main.main()
 """
-
-_ONE_BY_ONE = Lock()
-"""Lock for the start of a fishd: several starts at once would disturb the running ones."""
 
 Deed = Callable[[VirtualPi, Fishd], None]
 
@@ -121,15 +117,6 @@ class Outcome(Struct):
     """Reason of the fault in `status`, where fishd still answers."""
 
 
-def await_pulses(pi: VirtualPi, fishd: Fishd, count: int) -> None:
-    """Wait until the servo has received `count` angles."""
-    deadline = time.monotonic() + TIMEOUT_S
-    while len(pi.pigpiod.history(GPIO)) < count:
-        if time.monotonic() > deadline or fishd.process.poll() is not None:
-            raise SystemExit(f"fishd does not swim: {fishd.log.read_text()}")
-        time.sleep(0.01)
-
-
 def swim_again(fishd: Fishd) -> None:
     """Clear a fault, and let the tail beat for a second."""
     with Fish(fishd.endpoint) as fish:
@@ -146,18 +133,12 @@ def die(name: str, together: Barrier) -> Outcome:
         module, owner, method = PHASES[name]
         source = SABOTAGED_FISHD.format(module=module, owner=owner, method=method)
         command = (sys.executable, "-c", source)
-    settings = (
-        "servo.timeout=0.05",  # stalls of the machine must not cause a fault
-        "force_sensor.data_rate=128",  # the emulated sensor takes half a core at 860
-        "start.controller=square",
-    )
-    with ExitStack() as stack:
-        with _ONE_BY_ONE:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="fishd-")))
-            pi, on_it = stack.enter_context(virtual_pi(folder))
-            fishd = stack.enter_context(Fishd(*on_it, *settings, command=command))
-            await_pulses(pi, fishd, 1)
-        await_pulses(pi, fishd, 6)  # the tail has beaten from side to side a few times
+    with (
+        tempfile.TemporaryDirectory(prefix="fishd-") as folder,
+        virtual_pi(Path(folder)) as (pi, on_it),
+        closing(Lane(pi, on_it, 0, command)) as lane,
+    ):
+        fishd = lane.swim()
         together.wait(3 * TIMEOUT_S)
         if not pi.pigpiod.width(GPIO, time.monotonic()):
             swim_again(fishd)  # the machine stalled meanwhile, and fishd is in fault

@@ -109,7 +109,7 @@ class Hx711(ForceSensorDriver[Hx711Settings]):
                 for name, code in zip(self.names, (x, y), strict=True)
                 if code in (-STEPS, STEPS - 1)
             ),
-            "",
+            None,
         )
         return Pair(now - 1 / self.settings.rate, now, x * self._volts, y * self._volts, clipped)
 

@@ -202,8 +202,14 @@ class _View:
 
         status: status of the fishd that has ticked
         """
-        if not find_kind(status.robot).is_tethered or not isinstance(tick.alpha, float):
-            raise _no_sight(status.robot)
+        kind = find_kind(status.robot)
+        if kind.hides_from_camera or not isinstance(tick.alpha, float):
+            is_real = kind.has_hardware and not kind.is_virtual
+            raise Trouble(
+                "unusable",
+                kind.hides_from_camera or "this fishd does not publish the position of the tail",
+                "use source: v4l2" if is_real else "start fishd with robot: simulated",
+            )
         if math.isnan(tick.time):
             raise Trouble(
                 "unusable",
@@ -281,14 +287,3 @@ def _read_description(config: dict[str, Any]) -> FishDescription:
             f"the description of the fish by this fishd is not valid: {error}",
             "install the same version of fishd and fishd-camera",
         ) from None
-
-
-def _no_sight(robot: str) -> Trouble:
-    """Return the reason why a robot's fish cannot be drawn."""
-    reason = {
-        "virtual-pi": "a virtual Pi does not publish the position of the tail",
-        "swimmer": "a swimmer leaves the camera's view",
-    }.get(robot)
-    if reason:
-        return Trouble("unusable", reason, "start fishd with robot: simulated")
-    return Trouble("unusable", "this fishd drives a real fish", "use source: v4l2")

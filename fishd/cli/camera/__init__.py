@@ -14,17 +14,12 @@ VERBS = {
         "align": Verb("camera.align", "align", "Find the axis of motion, and how to turn it."),
         "latency": Verb("camera.latency", "latency", "Measure the delay of its pictures."),
     },
-    "Record": {
-        "record": Verb(
-            "recording.record", "record_camera", "Record its frames together with the fish."
-        ),
-    },
 }
 
 
 @click.group(cls=Verbs, verbs=VERBS)
 def camera() -> None:
-    """Show the picture of the camera above the tail, set it up, and record its frames.
+    """Show the picture of the camera above the tail, and set it up.
 
-    These verbs talk to a running fishd-camera.
+    These verbs talk to a running fishd-camera; `fishctl record --camera` records its frames.
     """

@@ -129,7 +129,7 @@ def checks(context: Context) -> Iterator[Check]:
         *(drivers.checks(context) if context.config.kind.has_hardware else ()),
         *service.CHECKS,
     )
-    return (check for check in all_checks if context.config.robot in check.robots)
+    return (check for check in all_checks if check.applies(context.config.kind))
 
 
 def examine(context: Context) -> Iterator[tuple[str, Result]]:

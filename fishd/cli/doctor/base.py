@@ -187,12 +187,12 @@ class Context(Machine):
         return self.running.status.limitations if self.running else ()
 
     @cached_property
-    def owner(self) -> str:
-        """Description of the fishd that drives a part of this robot, at any endpoint, or empty."""
+    def owner(self) -> str | None:
+        """Description of the fishd that drives a part of this robot, at any endpoint; or None."""
         try:
             return ownership.describe_owner(assembly.parts_of(self.config))
         except StartupError:  # invalid place of a virtual Pi; its check reports that
-            return ""
+            return None
 
     def occupied(self, by_fishd: str) -> Result | None:
         """Return the result of a check if a fishd uses the hardware; None if no fishd does.

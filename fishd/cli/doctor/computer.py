@@ -10,9 +10,18 @@ from fishd.assembly import state_folder
 from fishd.cli.doctor.base import Context
 from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.errors import ConfigError
-from fishd.core.robots import ROBOTS
+from fishd.core.robots import RobotKind
 from fishd.hardware.calibration_files import CalibrationFolder
-from fishd.hardware.checks import Check, Result, fail, ok, skipped, user_name, warning
+from fishd.hardware.checks import (
+    Check,
+    Result,
+    fail,
+    ok,
+    on_this_machine,
+    skipped,
+    user_name,
+    warning,
+)
 
 LOW_DISK_BYTES, FULL_DISK_BYTES = 1e9, 50e6
 """Free space below which there is a warning, and below which the check fails [bytes]."""
@@ -221,13 +230,15 @@ def _visible_folder(folder: Path) -> Path:
     return next(path for path in (folder, *folder.parents) if os.access(path, os.F_OK))
 
 
-_WITH_HARDWARE = tuple(name for name, kind in ROBOTS.items() if kind.has_hardware)
+def _has_hardware(kind: type[RobotKind]) -> bool:
+    return kind.has_hardware
+
 
 CHECKS = (
-    Check("model", model, ("pi",)),
-    Check("system", system, ("pi",)),
-    Check("power", power, ("pi",)),
-    Check("state folder", state, _WITH_HARDWARE),
+    Check("model", model, on_this_machine),
+    Check("system", system, on_this_machine),
+    Check("power", power, on_this_machine),
+    Check("state folder", state, _has_hardware),
     Check("disk", disk),
-    Check("calibrations", calibrations, _WITH_HARDWARE),
+    Check("calibrations", calibrations, _has_hardware),
 )

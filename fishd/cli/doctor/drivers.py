@@ -14,7 +14,16 @@ from fishd.cli.doctor.base import Context
 from fishd.config.drivers import claims_of
 from fishd.core.clock import SystemClock
 from fishd.core.errors import ConfigError, MissingPackage, SensorError, ServoError, StartupError
-from fishd.hardware.checks import START_VIRTUAL_PI, Check, Result, fail, ok, skipped, warning
+from fishd.hardware.checks import (
+    START_VIRTUAL_PI,
+    Check,
+    Result,
+    fail,
+    ok,
+    on_this_machine,
+    skipped,
+    warning,
+)
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.hardware.registry import FORCE_SENSORS, SERVOS, driver_packages
 from fishd.hardware.servo import pulses
@@ -39,7 +48,7 @@ def checks(context: Context) -> tuple[Check, ...]:
             for _, meter, settings in meters
             for check in meter.find(settings.driver).checks(settings)
         ),
-        Check("gpio pins", pins, ("pi",)),
+        Check("gpio pins", pins, on_this_machine),
     )
 
 
@@ -144,7 +153,7 @@ def _judge_rate(per_tick: float, context: Context, details: str) -> Result:
     return ok(message)
 
 
-def _trial_windows(sensor: SampledSensor, tick: float) -> Iterator[tuple[int, str]]:
+def _trial_windows(sensor: SampledSensor, tick: float) -> Iterator[tuple[int, str | None]]:
     """Yield samples and suspicion of each window, without the first, when the sampler starts."""
     latest: SensorError | None = None
     start = time.monotonic()

@@ -10,7 +10,7 @@ from fishd.cli.doctor.base import ANSWER_TIMEOUT_S, Context, Running, Unreachabl
 from fishd.core import addresses, local_daemons
 from fishd.core.errors import FishError, StartupError
 from fishd.core.process.unix_sockets import is_open_to_all
-from fishd.hardware.checks import Check, Result, fail, ok, skipped, warning
+from fishd.hardware.checks import Check, Result, fail, ok, on_this_machine, skipped, warning
 
 UNIT = "fishd.service"
 _UNIT_FOLDERS = ("/etc/systemd/system", "/usr/local/lib/systemd/system", "/usr/lib/systemd/system")
@@ -147,5 +147,5 @@ CHECKS = (
     Check("telemetry", telemetry),
     Check("control", control),
     Check("camera", camera),
-    Check("systemd", unit, ("pi",)),
+    Check("systemd", unit, on_this_machine),
 )

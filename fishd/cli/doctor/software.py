@@ -9,8 +9,8 @@ from importlib import metadata
 from fishd.cli.doctor.base import Context, sudo_unless
 from fishd.core.errors import MissingPackage, StartupError, install_command
 from fishd.hardware import header
-from fishd.hardware.checks import Check, Result, fail, ok, warning
-from fishd.hardware.panel_pins import ChipPins, find_chip, find_pins
+from fishd.hardware.checks import Check, Result, fail, ok, on_this_machine, warning
+from fishd.hardware.panel_pins import find_chip
 from fishd.hardware.registry import PACKAGES
 
 _MODULES = {package: module for module, package in PACKAGES.items()} | {
@@ -22,8 +22,6 @@ _MODULES = {package: module for module, package in PACKAGES.items()} | {
 _REQUIREMENT = re.compile(
     r"(?P<name>[\w.-]+)\s*(?P<bounds>[^;]*)(;.*extra == [\"'](?P<extra>.+)[\"'])?"
 )
-_SWIMMER_PACKAGES = {("swimmer", "numba"), ("lab", "scipy")}
-"""Extra and package of each requirement of `robot: swimmer`."""
 _BOUND = re.compile(r"(>=|<|==)\s*([\d.]+)")
 
 
@@ -57,8 +55,8 @@ def packages(context: Context) -> Result:
         match = _REQUIREMENT.match(text)
         assert match
         name, extra = match["name"].lower(), match["extra"]
-        is_for_swimmer = not kind.is_tethered and (extra, name) in _SWIMMER_PACKAGES
-        if extra is None or (extra == "pi" and name in packages) or is_for_swimmer:
+        of_driver = extra == "pi" and name in packages
+        if extra is None or of_driver or (extra, name) in kind.packages:
             requirements.append((name, match["bounds"]))
     problems = [
         problem for name, bounds in requirements if (problem := _find_problem(name, bounds))
@@ -70,7 +68,7 @@ def packages(context: Context) -> Result:
 
 
 def gpio_package(context: Context) -> Result | None:
-    """Check the packages for pins of the header: gpiod for the panel, RPi.GPIO for drivers."""
+    """Check the packages with which drivers use pins of the header."""
     drivers = [
         settings.driver
         for _, plugins, settings in context.drivers
@@ -90,15 +88,10 @@ def gpio_package(context: Context) -> Result | None:
             f"{install_command('rpi-lgpio')}; or rpi-gpio, on a Pi 4 and older",
         )
     used = installed if drivers else []
-    if context.config.panel.has_pins:
-        try:
-            used = sorted({*used, *(["gpiod"] if find_pins() is ChipPins else installed)})
-        except MissingPackage as error:
-            return fail(str(error), install_command("pi"))
     if "RPi.GPIO" in used and "Raspberry Pi 5" in context.model:
         return fail(
             "RPi.GPIO does not work on a Pi 5",
-            f"{pip} uninstall RPi.GPIO; {install_command('rpi-lgpio' if drivers else 'pi')}",
+            f"{pip} uninstall RPi.GPIO; {install_command('rpi-lgpio')}",
         )
     return ok(", ".join(used)) if used else None
 
@@ -108,9 +101,9 @@ def gpio_chip(context: Context) -> Result | None:
     if not context.config.panel.has_pins:
         return None
     try:
-        return ok(find_chip()) if find_pins() is ChipPins else None
-    except MissingPackage:  # `gpio_package` reports it
-        return None
+        return ok(find_chip())
+    except MissingPackage as error:
+        return fail(str(error), install_command("pi"))
     except StartupError as error:
         problem, _, remedy = str(error).partition("; ")
         return fail(problem, remedy)
@@ -142,6 +135,6 @@ def _parse_version(version: str) -> list[int]:
 CHECKS = (
     Check("configuration", configuration),
     Check("packages", packages),
-    Check("gpio package", gpio_package, ("pi",)),
-    Check("gpio chip", gpio_chip, ("pi",)),
+    Check("gpio package", gpio_package, on_this_machine),
+    Check("gpio chip", gpio_chip, on_this_machine),
 )

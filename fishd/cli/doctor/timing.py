@@ -8,8 +8,8 @@ import subprocess
 from fishd.cli.doctor.base import Context
 from fishd.core.process import safe_path
 from fishd.core.process.realtime import required_priority_limit
-from fishd.core.robots import ROBOTS
-from fishd.hardware.checks import Check, Result, ok, skipped, warning
+from fishd.core.robots import RobotKind
+from fishd.hardware.checks import Check, Result, ok, on_this_machine, skipped, warning
 
 _TRIAL = "import os, sys; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(sys.argv[1])))"
 _LIMITS_FILE = "/etc/security/limits.d/fishd.conf"
@@ -18,8 +18,6 @@ SUFFICIENT_LOCKED_BYTES = 512 * 2**20
 SERVICE_PRIORITY_LIMIT = 51
 """LimitRTPRIO= of the installed fishd.service."""
 _CAP_IPC_LOCK = 14
-_REAL_TIME_ROBOTS = tuple(name for name, kind in ROBOTS.items() if kind.is_real_time)
-"""Robots whose ticks can be late; those of a swimmer, in slow motion, cannot."""
 _UNSYNCHRONISED = 0x40
 _TIME_ERROR = 5
 
@@ -119,9 +117,13 @@ def _allow(limit: str, more: str = "") -> str:
     return f"run fishd as its systemd service{more}, or allow '{limit}' in {_LIMITS_FILE}"
 
 
+def _is_real_time(kind: type[RobotKind]) -> bool:
+    return kind.is_real_time  # else no tick can be late
+
+
 CHECKS = (
-    Check("real time", realtime, _REAL_TIME_ROBOTS),
-    Check("memory", memory, _REAL_TIME_ROBOTS),
-    Check("governor", governor, ("pi",)),
+    Check("real time", realtime, _is_real_time),
+    Check("memory", memory, _is_real_time),
+    Check("governor", governor, on_this_machine),
     Check("clock", clock),
 )

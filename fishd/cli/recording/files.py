@@ -2,7 +2,7 @@
 
 import math
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -51,20 +51,21 @@ def _target_option(suffixes: str) -> Callable[[F], F]:
     )
 
 
-def _target_paths(
-    target: Path | None, run: Run, forms: Sequence[str], form: str | None
-) -> list[Path]:
-    """Return the files to write: the target, or in that folder a file for each form.
+def _target_path(target: Path | None, run: Run, form: str | None) -> Path:
+    """Return the file to write: the target, or in that folder a file of this format.
 
     target: None for the folder of the recording
-    form: the only form in that folder; None for all
     """
     target = target or run.path.parent
-    if target.is_dir():
-        return [target / f"{run.name}.{chosen}" for chosen in ([form] if form else forms)]
-    if form and target.suffix != f".{form}":
-        raise click.UsageError(f"--{form}: --to {target} is a file of another format, or no folder")
-    return [target]
+    if not target.is_dir():
+        if form and target.suffix != f".{form}":
+            raise click.UsageError(
+                f"--{form}: --to {target} is a file of another format, or no folder"
+            )
+        return target
+    if form is None:
+        raise click.UsageError("--csv or --parquet is needed, or the name of a file for --to")
+    return target / f"{run.name}.{form}"
 
 
 @click.command()
@@ -95,10 +96,7 @@ def export(
     from fishd.recording.export import export as write
 
     recorded = open_recording(run, folder)
-    forms = ("csv", "parquet")
-    path, *others = _target_paths(target, recorded, forms, form)
-    if others:
-        raise click.UsageError("--csv or --parquet is needed, or the name of a file for --to")
+    path = _target_path(target, recorded, form)
     print_paths(write(recorded, path, replace=force), as_json)
 
 
@@ -133,10 +131,11 @@ def plot(
 
     recorded = open_recording(run, folder)
     run_traces = traces(recorded, begin, math.inf if end is None else end)
-    paths = _target_paths(target, recorded, ("png",), None)
-    check_new_files(paths, replace=force)
-    draw_run(run_traces, paths[0])
-    print_paths(paths, as_json)
+    path = target or recorded.path.parent
+    path = path / f"{recorded.name}.png" if path.is_dir() else path
+    check_new_files([path], replace=force)
+    draw_run(run_traces, path)
+    print_paths([path], as_json)
 
 
 @click.command()

@@ -2,34 +2,32 @@
 
 import re
 import shutil
-import signal
 import sys
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import click
 from msgspec.structs import asdict
 
-from fishd.cli.camera.options import camera_option
 from fishd.cli.options import Utf8Text, endpoint_option, for_option, json_option
 from fishd.cli.output import echo, format_count, print_json
 from fishd.cli.recording.files import folder_option
 from fishd.client import Fish
 from fishd.core import text
 from fishd.core.errors import FishError, NoDaemon, RecordingError
+from fishd.core.process.interruption import caught_signals
 from fishd.recording import RunWriter
 from fishd.recording.black_box import BlackBox
 from fishd.recording.folder import ensure_folder, open_new, recording_path, runs_folder
 from fishd.recording.recorder import MIN_FREE_BYTES, Position, Recorder
 
 if TYPE_CHECKING:
-    from fishd.lab.camera_tap import CameraTap
+    from fishd.recording.camera_tap import CameraTap
 
-F = TypeVar("F", bound=Callable[..., Any])
 UNIT_BYTES = {"MB": 10**6, "GB": 10**9}
 INCOMPLETE = 3
 """Exit status of a recorder that lost ticks or frames, or may have."""
@@ -62,27 +60,6 @@ class BlackBoxSize(click.ParamType[int]):
         return round(size)
 
 
-def _recording_options(function: F) -> F:
-    """Add RUN, and the options of every verb that records."""
-    for decorate in (
-        json_option,
-        for_option("End by itself after this time [s]; by default Ctrl-C ends it."),
-        click.option("--note", type=Utf8Text(), default="", help="Purpose of the recording."),
-        click.option("--subject", type=Utf8Text(), default="", help="Name or number of the fish."),
-        click.option(
-            "--operator",
-            type=Utf8Text(),
-            default="",
-            help="Name of the operator; default: this user.",
-        ),
-        folder_option,
-        endpoint_option,
-        click.argument("run", required=False),
-    ):
-        function = decorate(function)
-    return function
-
-
 class _Record(click.Command):
     """Verb whose `--camera` may stand alone: the next word is an address if it looks like one."""
 
@@ -96,7 +73,16 @@ class _Record(click.Command):
 
 
 @click.command(cls=_Record)
-@_recording_options
+@click.argument("run", required=False)
+@endpoint_option
+@folder_option
+@click.option(
+    "--operator", type=Utf8Text(), default="", help="Name of the operator; default: this user."
+)
+@click.option("--subject", type=Utf8Text(), default="", help="Name or number of the fish.")
+@click.option("--note", type=Utf8Text(), default="", help="Purpose of the recording.")
+@for_option("End by itself after this time [s]; by default Ctrl-C ends it.")
+@json_option
 @click.option(
     "--camera",
     metavar="[ADDRESS]",
@@ -156,42 +142,16 @@ def record(
         def open_recorder(after: Position | None) -> Recorder:
             return Recorder(endpoint, box.open, tell=_print_line, after=after, due=box.due)
 
-        _record_endlessly(open_recorder, has_room, _StopSignals(), seconds, as_json)
+        with caught_signals() as stopping:
+            _record_endlessly(open_recorder, has_room, stopping, seconds, as_json)
         return
-    if camera is None:
-        _record_one(run, endpoint, folder, begin, seconds, as_json)
-        return
-    from fishd.lab.camera_tap import CameraTap
+    with ExitStack() as stack:
+        tap = None
+        if camera is not None:
+            from fishd.recording.camera_tap import CameraTap
 
-    with CameraTap(camera or None, endpoint) as tap:
+            tap = stack.enter_context(CameraTap(camera or None, endpoint))
         _record_one(run, endpoint, folder, begin, seconds, as_json, tap)
-
-
-@click.command("record")
-@_recording_options
-@camera_option
-def record_camera(
-    run: str | None,
-    endpoint: str | None,
-    folder: Path | None,
-    operator: str,
-    subject: str,
-    note: str,
-    seconds: float | None,
-    as_json: bool,
-    address: str | None,
-) -> None:
-    """Record a running fish and the frames of the camera above it in one file.
-
-    RUN is a name in the folder of recordings or a path; by default the date and time. As `fishctl
-    record --camera`. If the camera is lost, the recording goes on; the loss is reported and
-    counted, and the exit status is 3.
-    """
-    from fishd.lab.camera_tap import CameraTap
-
-    begin = partial(RunWriter, operator=operator, subject=subject, note=note)
-    with CameraTap(address, endpoint) as camera:
-        _record_one(run, endpoint, folder, begin, seconds, as_json, camera)
 
 
 def _record_one(
@@ -201,13 +161,12 @@ def _record_one(
     begin: Callable[[Path], RunWriter],
     seconds: float | None,
     as_json: bool,
-    camera: "CameraTap | None" = None,
+    camera: "CameraTap | None",
 ) -> None:
     """Record until a signal, or until a time has passed.
 
     begin: opens the recording at a path; seconds: longest duration [s]
     """
-    stopping = _StopSignals()
     place = ensure_folder(folder or runs_folder())
     progress = _draw if sys.stdout.isatty() and not as_json else lambda writer: None
     open_writer = (
@@ -215,7 +174,7 @@ def _record_one(
     )
     recorder = Recorder(endpoint, open_writer, tell=_print_line, progress=progress, camera=camera)
     try:
-        with recorder:
+        with caught_signals() as stopping, recorder:
             echo(f"recording to {recorder.writer.path}; Ctrl-C ends it", err=as_json)
             if (mode := recorder.status.mode) != "running":
                 clearing = "fishctl clear-fault, then " if mode in ("fault", "estop") else ""
@@ -223,7 +182,7 @@ def _record_one(
                     f"the fish is at rest (mode {mode}); it swims with: {clearing}fishctl "
                     "set-controller"
                 )
-            recorder.run(stopping, seconds)
+            recorder.run(partial(stopping, 0.0), seconds)
     except RecordingError as error:
         if recorder.began:
             _mark_in_fishd(endpoint, f"recording {recorder.writer.path.name} ended: {error}")
@@ -239,7 +198,7 @@ def _record_one(
 def _record_endlessly(
     open_recorder: Callable[[Position | None], Recorder],
     has_room: Callable[[], bool],
-    stopping: "_StopSignals",
+    stopping: Callable[[float], bool],
     seconds: float | None,
     as_json: bool,
 ) -> None:
@@ -249,19 +208,19 @@ def _record_endlessly(
     """
     waiting, failure = False, None
     position: Position | None = None
-    while not stopping():
+    while not stopping(0.0):
         recorder = open_recorder(position)
         try:
             with recorder:
                 echo(f"recording to {recorder.writer.path}", err=as_json)
                 failure = None
-                recorder.run(stopping, seconds)
+                recorder.run(partial(stopping, 0.0), seconds)
                 return
         except NoDaemon as error:
             if not waiting:
                 _print_line(f"waiting: {error}")
             waiting = True
-            stopping.wait(1.0)
+            stopping(1.0)
         except RecordingError as error:
             position = recorder.position
             if position is None:
@@ -269,32 +228,11 @@ def _record_endlessly(
             if failure is None:
                 _print_line(f"{error}; the black box tries again every {DISK_RETRY_S:.0f} s")
             failure = error
-            stopping.wait(DISK_RETRY_S)
-            while not (has_room() or stopping()):
-                stopping.wait(DISK_RETRY_S)
+            stopping(DISK_RETRY_S)
+            while not (has_room() or stopping(0.0)):
+                stopping(DISK_RETRY_S)
     if failure:
         raise failure
-
-
-class _StopSignals:
-    """Stop request: true after Ctrl-C, SIGTERM, or when the terminal closes."""
-
-    def __init__(self) -> None:
-        self._is_set = False
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) is not signal.SIG_IGN:  # ignored below nohup
-                signal.signal(number, self._set)
-
-    def __call__(self) -> bool:
-        return self._is_set
-
-    def wait(self, seconds: float) -> None:
-        """Wait for a signal, up to some seconds."""
-        if not self._is_set:
-            signal.sigtimedwait((), seconds)
-
-    def _set(self, *_: object) -> None:
-        self._is_set = True
 
 
 def _print_line(line: str) -> None:

@@ -8,17 +8,17 @@ import msgspec
 
 from fishd.cli.config import fish_options
 from fishd.cli.controller_arguments import ControllerGroup
-from fishd.cli.free_swim import format_speed
 from fishd.cli.options import F, FiniteRange, json_option
 from fishd.cli.output import echo, echo_rows, format_controller, print_json
+from fishd.cli.swimmer.simulation import format_speed
 from fishd.config import load
 from fishd.controllers import registry
 from fishd.core import text
 from fishd.core.errors import FishdError, ParameterError
 from fishd.lab.sweep.grid import Lengths, Point
-from fishd.lab.sweep.measuring import swim_freely
 from fishd.lab.swimmer import refinement
 from fishd.lab.swimmer.refinement import Estimate, GridSpeed, Refinement
+from fishd.lab.swimmer.speed import swim_freely
 
 
 def refine_options(function: F) -> F:

@@ -74,10 +74,10 @@ class LateralSign:
         self._largest = 0.0
 
     @property
-    def complaint(self) -> str:
-        """Line with the problem and its remedy; empty unless F_y is reversed."""
+    def complaint(self) -> str | None:
+        """Line with the problem and its remedy; None unless F_y is reversed."""
         if not self.reversed:
-            return ""
+            return None
         return (
             "F_y is reversed: it pushed in the direction in which the tail began to move, "
             f"{CONSEQUENCES[self.treatment]}; where a positive angle moves the tail to the fish's "

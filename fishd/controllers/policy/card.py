@@ -5,7 +5,6 @@ another tick, for another amplitude or on other pictures than those of its train
 """
 
 import math
-from collections.abc import Callable
 from operator import attrgetter
 from typing import Annotated, Any, Literal
 
@@ -57,28 +56,6 @@ class Feature(Struct, frozen=True, forbid_unknown_fields=True):
     """Value that becomes 1 in the network's input, in the unit of the observation's field."""
 
 
-class Layout:
-    """Conversion of an observation to the network's input: each feature divided by its scale."""
-
-    def __init__(self, features: tuple[Feature, ...]) -> None:
-        self.features = features
-        self._inputs = [
-            (place, attrgetter(feature.name), 1.0 / feature.scale)
-            for place, feature in enumerate(features)
-        ]
-
-    def vector(self, observation: Observation) -> NDArray[np.float32]:
-        """Return the input, shape (number of features,), dimensionless."""
-        row = np.empty(len(self._inputs), np.float32)
-        self.write(observation, row)
-        return row
-
-    def write(self, observation: Observation, row: NDArray[np.float32]) -> None:
-        """Write the input to an existing array, which is faster."""
-        for place, value, factor in self._inputs:
-            row[place] = value(observation) * factor
-
-
 class Window(Struct, frozen=True):
     """Window of ticks whose features are the input of a network."""
 
@@ -108,29 +85,30 @@ class History:
         window: window of ticks
         row: array for the input, shape (ticks × features,); by default a new one
         """
-        self._layout = Layout(features)
+        self._inputs = [
+            (place, attrgetter(feature.name), 1.0 / feature.scale)
+            for place, feature in enumerate(features)
+        ]
         self._window = window
         self.row = np.zeros(window.ticks * len(features), np.float32) if row is None else row
-        """Input of the network, dimensionless."""
-        self._given = self.row.reshape(window.ticks, len(features))
+        """Input of the network, dimensionless: each feature divided by its scale."""
+        self._ticks = self.row.reshape(window.ticks, len(features))
         self._time = -math.inf
-        self.push: Callable[[Observation], None] = self._only if window.ticks == 1 else self._next
-        """Method that adds the observation of a tick."""
 
     def forget(self) -> None:
         """Restart the history with the next observation."""
         self._time = -math.inf
 
-    def _only(self, observation: Observation) -> None:
-        self._layout.write(observation, self.row)
-
-    def _next(self, observation: Observation) -> None:
-        rows, elapsed = self._given, observation.time - self._time
+    def push(self, observation: Observation) -> None:
+        """Add the observation of a tick."""
+        rows, elapsed = self._ticks, observation.time - self._time
         if elapsed > 0.0:
             rows[1:] = rows[:-1]
-        self._layout.write(observation, rows[0])
+        newest = rows[0]
+        for place, value, factor in self._inputs:
+            newest[place] = value(observation) * factor
         if not 0.0 <= elapsed < self._window.span:
-            rows[1:] = rows[0]
+            rows[1:] = newest
         self._time = observation.time
 
 

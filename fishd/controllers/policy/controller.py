@@ -120,11 +120,10 @@ class Ppo(Controller[PpoParameters]):
 
 
 def _open(parameters: PpoParameters, limits: Limits) -> "tuple[Card, Network]":
-    from fishd.controllers.policy import opening
     from fishd.controllers.policy.runtime import Network
 
     try:
-        policy = opening.read(parameters.policy, limits)
+        policy = library.open_policy(parameters.policy, limits)
         if policy.card.pictures:
             raise PolicyError(
                 f"{policy.path}: it needs pictures, which this loop does not have; run it with "

@@ -4,19 +4,18 @@ A policy file is an ONNX model with a card (`card.Card`) in its metadata. Messag
 is refused, and the remedy.
 """
 
+import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from fishd.controllers.policy import checksum, operators
 from fishd.controllers.policy.card import CARD_KEY, Card, decode
-from fishd.controllers.policy.checksum import SEAL_REMEDY
 from fishd.core import files
 from fishd.core.errors import PolicyError
-from fishd.core.text import describe_error, quoted
+from fishd.core.text import describe_error, error_message, quoted
 
 if TYPE_CHECKING:
     from onnx import GraphProto, ModelProto, TensorProto, ValueInfoProto
@@ -38,6 +37,41 @@ MISSING_PACKAGE = (
     "32-bit ARM"
 )
 
+CHECKSUM_KEY = "fishd.sha256"
+"""Key of the checksum in the metadata of an ONNX file."""
+SEAL_REMEDY = "call fishd.controllers.policy.file.seal as the last step"
+PERMITTED: Mapping[str, tuple[str, ...]] = {
+    "layers": ("Gemm", "MatMul", "Conv", "BatchNormalization", "LayerNormalization"),
+    "activations": (
+        *("Celu", "Clip", "Elu", "Erf", "Gelu", "HardSigmoid", "HardSwish", "LeakyRelu"),
+        *("LogSoftmax", "Mish", "PRelu", "Relu", "Selu", "Sigmoid", "Softmax", "Softplus"),
+        *("Softsign", "Tanh", "ThresholdedRelu"),
+    ),
+    "arithmetic": (
+        *("Abs", "Add", "Ceil", "Cos", "Div", "Exp", "Floor", "Log", "Max", "Mean", "Min"),
+        *("Mul", "Neg", "Pow", "Reciprocal", "Round", "Sign", "Sin", "Sqrt", "Sub", "Sum"),
+    ),
+    "sums": ("ArgMax", "GlobalAveragePool", "ReduceMax", "ReduceMean", "ReduceMin", "ReduceSum"),
+    "choices": (
+        *("And", "Equal", "Greater", "GreaterOrEqual", "Less", "LessOrEqual", "Not", "Or"),
+        "Where",
+    ),
+    "shapes": (
+        *("Cast", "Concat", "Constant", "ConstantOfShape", "Expand", "Flatten", "Gather"),
+        *("Identity", "Reshape", "Shape", "Slice", "Split", "Squeeze", "Transpose", "Unsqueeze"),
+    ),
+}
+"""Operators of ONNX itself that a network may use, by purpose; each of them ends by itself."""
+
+OPSETS = range(11, 27)
+"""Supported versions of these operators."""
+IR_VERSION = 7
+"""Version of the format that every supported onnxruntime can read."""
+MAX_NODES = 1000
+
+
+_NAMES = frozenset(name for names in PERMITTED.values() for name in names)
+_ONNX_DOMAINS = ("", "ai.onnx")
 _HIDDEN_FOLDERS = ("/home/", "/root/", "/run/user/")
 """Folders that systemd's ProtectHome= hides from a service."""
 
@@ -73,14 +107,45 @@ def parse(content: bytes) -> Card:
 
 def _check_model(content: bytes, model: "ModelProto") -> Card:
     text = _card_text(model)
-    if checksum.has_checksum(model):  # first, for the right error about a damaged card
-        checksum.check(content, model)
+    checksums = [entry.value for entry in model.metadata_props if entry.key == CHECKSUM_KEY]
+    # Before the card, since damage may have changed that.
+    if checksums and checksums != [_digest(content, checksums[0])]:
+        raise PolicyError(
+            "it is damaged: its content does not match its checksum; copy it again; in a program "
+            f"that changes it, {SEAL_REMEDY}"
+        )
     card = decode(text)
-    checksum.check(content, model)
-    _check_ends(model.graph, card)
+    if not checksums:
+        raise PolicyError(
+            f"its metadata lacks {CHECKSUM_KEY}, the checksum; in the program that made the file, "
+            f"{SEAL_REMEDY}"
+        )
+    _check_values("inputs", _inputs(model.graph), network_inputs(card))
+    _check_values("outputs", model.graph.output, [(OUTPUT, "float32", (1, 1))])
     _check_numbers(model.graph)
-    operators.check(model)
+    check_operators(model)
     return card
+
+
+def seal(model: "ModelProto") -> bytes:
+    """Return the file of a model with its checksum, which replaces an existing one."""
+    kept = [(entry.key, entry.value) for entry in model.metadata_props if entry.key != CHECKSUM_KEY]
+    del model.metadata_props[:]
+    for key, value in kept:
+        model.metadata_props.add(key=key, value=value)
+    # A placeholder that does not occur in the model.
+    placeholder = hashlib.sha256(model.SerializeToString()).hexdigest()
+    model.metadata_props.add(key=CHECKSUM_KEY, value=placeholder)
+    content: bytes = model.SerializeToString()
+    return content.replace(placeholder.encode(), _digest(content, placeholder).encode())
+
+
+def _digest(content: bytes, checksum: str) -> str:
+    """Return the hexadecimal SHA-256 of a file with zeros in place of its checksum."""
+    encoded = checksum.encode()
+    if content.count(encoded) != 1:
+        return ""
+    return hashlib.sha256(content.replace(encoded, b"0" * 64)).hexdigest()
 
 
 def _why_hidden(path: Path) -> str:
@@ -141,11 +206,6 @@ def _card_text(model: "ModelProto") -> str:
             f"keep one, and {SEAL_REMEDY}"
         )
     return str(cards[0])
-
-
-def _check_ends(graph: "GraphProto", card: Card) -> None:
-    _check_values("inputs", _inputs(graph), network_inputs(card))
-    _check_values("outputs", graph.output, [(OUTPUT, "float32", (1, 1))])
 
 
 def _inputs(graph: "GraphProto") -> "list[ValueInfoProto]":
@@ -214,24 +274,25 @@ def _format_form(form: _TensorForm) -> str:
 
 def _check_numbers(graph: "GraphProto") -> None:
     """Check that every number of the model is in this file and finite."""
-    for tensor in graph.initializer:
-        _check_tensor(tensor)
     if graph.sparse_initializer:
         raise PolicyError(f"its weights are sparse; save them as plain ones, and {SEAL_REMEDY}")
     for node in graph.node:
         for attribute in node.attribute:
             if not np.isfinite([attribute.f, *attribute.floats]).all():
-                raise PolicyError(
-                    _not_finite(
-                        f"'{quoted(attribute.name)}' of '{quoted(node.name or node.op_type)}'"
-                    )
-                )
-            for tensor in (attribute.t, *attribute.tensors):
-                _check_tensor(tensor)
-            if attribute.HasField("sparse_tensor") or attribute.sparse_tensors:
-                raise PolicyError(
-                    f"its constants are sparse; save them as plain ones, and {SEAL_REMEDY}"
-                )
+                name = node.name or node.op_type
+                raise _not_finite(f"'{quoted(attribute.name)}' of '{quoted(name)}'")
+    for tensor in _tensors(graph):
+        _check_tensor(tensor)
+
+
+def _tensors(graph: "GraphProto") -> "Iterator[TensorProto]":
+    """Yield the weights of a network, and the constants of its operators."""
+    yield from graph.initializer
+    for node in graph.node:
+        for attribute in node.attribute:
+            if attribute.HasField("t"):
+                yield attribute.t
+            yield from attribute.tensors
 
 
 def _check_tensor(tensor: "TensorProto") -> None:
@@ -243,19 +304,59 @@ def _check_tensor(tensor: "TensorProto") -> None:
             f"its {what} are in another file; save the model as a single file (torch.onnx.export: "
             f"external_data=False), and {SEAL_REMEDY}"
         )
-    if tensor.data_type == TensorProto.UNDEFINED:  # an attribute without a tensor
-        return
     try:
         array = numpy_helper.to_array(tensor)
         numbers = array if array.dtype.kind in "biufc" else array.astype(np.float32)
     except Exception as error:  # a tensor may be inconsistent in many ways
         raise PolicyError(f"its {what} cannot be read: {describe_error(error)}") from None
     if not np.isfinite(numbers).all():
-        raise PolicyError(_not_finite(what))
+        raise _not_finite(what)
 
 
-def _not_finite(what: str) -> str:
-    return (
+def _not_finite(what: str) -> PolicyError:
+    return PolicyError(
         f"its {what} are not all finite numbers: the training diverged; export an earlier "
         "checkpoint"
     )
+
+
+def check_operators(model: "ModelProto") -> None:
+    """Raise `PolicyError` for a model with other operators, or one that contradicts itself."""
+    import onnx
+
+    if model.functions:
+        raise PolicyError(
+            f"it defines a custom operator, {quoted(model.functions[0].name)}; replace it by those "
+            f"of ONNX with onnx.inliner.inline_local_functions, and {SEAL_REMEDY}"
+        )
+    if model.ir_version > onnx.IR_VERSION:
+        raise PolicyError(
+            f"its ir_version is {model.ir_version}; the installed onnx reads up to "
+            f"{onnx.IR_VERSION}: set model.ir_version to {IR_VERSION}, and {SEAL_REMEDY}"
+        )
+    versions = [entry.version for entry in model.opset_import if entry.domain in _ONNX_DOMAINS]
+    if len(versions) != 1 or versions[0] not in OPSETS:
+        version_list = ", ".join(map(str, versions)) or "none"
+        raise PolicyError(
+            f"its version of ONNX's operators: {version_list}; one from {OPSETS[0]} to "
+            f"{OPSETS[-1]} is needed; convert the model with "
+            f"onnx.version_converter.convert_version, and {SEAL_REMEDY}"
+        )
+    nodes = model.graph.node
+    if len(nodes) > MAX_NODES:
+        raise PolicyError(f"it has {len(nodes)} operators; {MAX_NODES} are the most")
+    for node in nodes:
+        name = node.op_type
+        if node.domain not in _ONNX_DOMAINS or name not in _NAMES:
+            name = name if node.domain in _ONNX_DOMAINS else f"{node.domain}.{name}"
+            permitted = ", ".join(sorted(_NAMES))
+            raise PolicyError(
+                f"its operator {quoted(name)} is not permitted; permitted: {permitted}"
+            )
+    try:
+        onnx.checker.check_model(model, full_check=True)
+    except Exception as error:  # onnx's and protobuf's errors, and ValueError
+        raise PolicyError(
+            f"its network contradicts itself: {error_message(error)}; correct it in the program "
+            f"that made the file, and {SEAL_REMEDY}"
+        ) from None

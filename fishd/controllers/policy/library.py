@@ -7,11 +7,16 @@ $FISHD_POLICIES, `policies` in the state folder, /etc/fishd/policies, and what c
 import os
 import shlex
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fishd.core import files
 from fishd.core.errors import PolicyError
 from fishd.core.protocol import PolicyInfo
 from fishd.core.schema import names_file, suggest
+
+if TYPE_CHECKING:
+    from fishd.controllers.base import Limits
+    from fishd.controllers.policy.file import PolicyFile
 
 SUFFIX = ".onnx"
 FOLDERS_VARIABLE = "FISHD_POLICIES"
@@ -51,6 +56,26 @@ def find(text: str) -> Path:
             raise PolicyError(f"{text} {run}")
         raise PolicyError(unknown_name_message(text, sorted(known)))
     return known[text]
+
+
+def open_policy(text: str, limits: "Limits") -> "PolicyFile":
+    """Return the policy of a name or path if it fits these limits; else raise `PolicyError`."""
+    from fishd.controllers.policy import file
+
+    path = find(text)
+    policy = file.read(path)
+    try:
+        policy.card.check_fit(limits.tick, limits.amplitude)
+        if limits.scaled and any(
+            feature.name == "fin_velocity" for feature in policy.card.observation
+        ):
+            raise PolicyError(
+                "it was trained with the fin_velocity of estimator.kind: lateral_force, but "
+                "fishd uses another kind"
+            )
+    except PolicyError as error:
+        raise PolicyError(f"{path}: {error}") from None
+    return policy
 
 
 def describe_training_folder(path: Path) -> str:

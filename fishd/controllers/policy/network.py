@@ -6,9 +6,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.controllers.policy import file, operators
+from fishd.controllers.policy import file
 from fishd.controllers.policy.card import CARD_KEY, Card, encode
-from fishd.controllers.policy.checksum import seal
 from fishd.core.errors import PolicyError
 
 Layer = tuple[NDArray[Any], NDArray[Any]]
@@ -79,12 +78,12 @@ def to_onnx(
         graph,
         producer_name="fishd",
         producer_version=card.provenance.fishd,
-        ir_version=operators.IR_VERSION,
+        ir_version=file.IR_VERSION,
         opset_imports=[helper.make_opsetid("", OPSET)],
     )
     helper.set_model_props(model, {CARD_KEY: encode(card)})
     onnx.checker.check_model(model)
-    content = seal(model)
+    content = file.seal(model)
     file.parse(content)
     return content
 

@@ -57,22 +57,22 @@ def locked(path: Path, *, remove: bool = False) -> Iterator[None]:
         os.close(lock)
 
 
-def find_lock_holder(path: Path) -> str:
-    """Return the pid of the process that holds the lock of `path`, or `unknown`; empty if none.
+def find_lock_holder(path: Path) -> str | None:
+    """Return the pid of the process that holds the lock of `path`, or `unknown`; None if none.
 
     The check holds the lock for a moment.
     """
     try:
         lock = _open_lock(lock_path(path), os.O_RDONLY)
     except OSError:  # it was never held, or this user may not read it
-        return ""
+        return None
     try:
         fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return _read_pid(lock)
     finally:
         os.close(lock)
-    return ""
+    return None
 
 
 def _acquire_lock(path: Path) -> int:
@@ -117,8 +117,8 @@ def _open_lock(path: Path, flags: int) -> int:
     return lock
 
 
-def _find_lock_problem(status: os.stat_result, folder: Path) -> str:
-    """Return why an open file is not a lock file of fishd; empty if it is one."""
+def _find_lock_problem(status: os.stat_result, folder: Path) -> str | None:
+    """Return why an open file is not a lock file of fishd; None if it is one."""
     if not stat.S_ISREG(status.st_mode):
         return "not a regular file"
     if status.st_nlink > 1:
@@ -126,7 +126,7 @@ def _find_lock_problem(status: os.stat_result, folder: Path) -> str:
     owners = {os.geteuid(), 0, folder.stat().st_uid}
     if status.st_uid not in owners:
         return f"a file of user {status.st_uid}"
-    return ""
+    return None
 
 
 def _read_pid(lock: int) -> str:

@@ -76,26 +76,11 @@ class JsonFormatter(logging.Formatter):
         return msgspec.json.encode(fields).decode()
 
 
-class _NoLock:
-    """Replacement of a lock that a controller might never release: it never blocks."""
-
-    def acquire(self) -> bool:
-        """Return True."""
-        return True
-
-    def release(self) -> None:
-        """Do nothing."""
-
-    __enter__ = acquire
-
-    def __exit__(self, *_: object) -> None:
-        """Do nothing."""
-
-
 class _Queued(logging.handlers.QueueHandler):
-    def createLock(self) -> None:  # noqa: N802  (logging's name)
-        """Use no lock: a queue needs none, and a thread that hangs here must not block others."""
-        self.lock = _NoLock()  # type: ignore[assignment]
+    def handle(self, record: logging.LogRecord) -> bool:
+        """Add the record without a lock: a thread that hangs here must not block others."""
+        self.emit(record)
+        return True
 
     def enqueue(self, record: logging.LogRecord) -> None:
         """Add the record to the queue; drop it if the queue is full."""

@@ -35,18 +35,18 @@ def check_length(path: str) -> None:
         )
 
 
-def find_trust_problem(path: Path) -> str:
-    """Return why this user must not trust the server at `path`; empty if it can be trusted.
+def find_trust_problem(path: Path) -> str | None:
+    """Return why this user must not trust the server at `path`; None if it can be trusted.
 
     Trusted users are this user, root, and the owner of a folder that only root can have created for
     them, such as /run/fishd for the service. No other user may write to the folder or listen there.
-    Empty also if there is no socket.
+    None also if there is no socket.
     """
     folder = path.parent
     try:
         folder_status, parent_status = folder.lstat(), folder.parent.stat()
     except OSError:
-        return ""
+        return None
     if stat.S_ISLNK(folder_status.st_mode) and not _only_root_may_write(parent_status):
         return f"{folder} is a symbolic link"
     folder_status = folder.stat() if stat.S_ISLNK(folder_status.st_mode) else folder_status
@@ -61,7 +61,7 @@ def find_trust_problem(path: Path) -> str:
         listener = find_listener(path)
         if listener and listener.user not in trusted:
             return f"a process of user {listener.user} listens there"
-    return ""
+    return None
 
 
 def is_open_to_all(folder: Path) -> bool:

@@ -31,7 +31,7 @@ class KnownKeys:
         self.path = folder / keys.KNOWN_FILE
         self._clients: dict[str, keys.KnownKey] = {}
         self._change = ""
-        self._stamp: tuple[int, int, int, str] | None = None
+        self._stamp: tuple[int, int, int, str | None] | None = None
         while self._stamp is None:
             self._update()
             time.sleep(SETTLE_TIME_S / 10)
@@ -81,7 +81,7 @@ class KnownKeys:
                 f" has the role {client.what} in {self.path}",
             )
 
-    def _read_stamp(self) -> tuple[int, int, int, str]:
+    def _read_stamp(self) -> tuple[int, int, int, str | None]:
         """Return time of the last change and size of the file, and what else shows another one."""
         problem = find_folder_problem(self.path.parent)
         try:

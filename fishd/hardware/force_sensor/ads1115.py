@@ -72,8 +72,7 @@ class Ads1115Settings(ForceSensorSettings, frozen=True, forbid_unknown_fields=Tr
         unit(
             "V",
             "Voltage of the input at or above which its amplifier counts as saturated; null for "
-            "none. With a full_scale of 4.096 or 6.144, an amplifier at 3.3 V saturates before "
-            "the ADC clips.",
+            "none.",
         ),
     ] = 3.2
     data_rate: Annotated[
@@ -213,10 +212,10 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
             Check("adc", lambda machine: _chip(machine, settings)),
         )
 
-    def _clipped(self, channel: int, code: int) -> str:
-        """Return why a code is clipped, by the ADC or by its amplifier; empty if it is not."""
+    def _clipped(self, channel: int, code: int) -> str | None:
+        """Return why a code is clipped, by the ADC or by its amplifier; None if it is not."""
         if self._lowest < code < self._highest:
-            return ""
+            return None
         name = self.names[channel]
         if code in (-ADC_STEPS, self._largest):
             return f"{name} is clipped at {math.copysign(self.settings.full_scale, code):+g} V"

@@ -86,7 +86,7 @@ class SampledSensor(SampledPart[Pair]):
                 self._watches = [watch for watch in self._watches if not watch.closed]
                 for watch in self._watches:
                     watch.add(pairs, measurement.suspect)
-            self._latest = replace(measurement, samples=0, suspect="", extremes=None)
+            self._latest = replace(measurement, samples=0, suspect=None, extremes=None)
             return measurement
         if trouble := self._sampler.trouble:
             self._evaluation.interrupt()

@@ -46,7 +46,7 @@ class WindowEvaluation:
         frozen_x, frozen_y = self._x.check(vxs, newest), self._y.check(vys, newest)
         extremes = _extremes(vxs, vys, calibration)
         suspect = (
-            next(filter(None, clipped), "")
+            next(filter(None, clipped), None)
             or frozen_x
             or frozen_y
             or self._beyond_limit(extremes, calibration)
@@ -64,7 +64,7 @@ class WindowEvaluation:
         """Return the unit of the forces that this calibration gives."""
         return self._raw_unit if calibration.is_unset else "N"
 
-    def _beyond_limit(self, extremes: Extremes, calibration: ForceCalibration) -> str:
+    def _beyond_limit(self, extremes: Extremes, calibration: ForceCalibration) -> str | None:
         limit = self._limit
         for name, low, high in (
             ("F_x", extremes.fx_min, extremes.fx_max),
@@ -76,7 +76,7 @@ class WindowEvaluation:
                 if calibration.is_unset:
                     reason += f" (not calibrated: 1 {self._raw_unit} counts as 1 N)"
                 return reason
-        return ""
+        return None
 
 
 def _extremes(
@@ -101,8 +101,8 @@ class _FrozenCodeDetector:
         self._value: float | None = None
         self._since = math.inf
 
-    def check(self, values: Sequence[float], newest: float) -> str:
-        """Return why the values are suspect, or an empty string.
+    def check(self, values: Sequence[float], newest: float) -> str | None:
+        """Return why the values are suspect; None if they are not.
 
         newest: time of the last value [s, monotonic]
         """
@@ -112,7 +112,7 @@ class _FrozenCodeDetector:
             self._since = newest
         unchanged = newest - self._since
         if unchanged < self._frozen_after:
-            return ""
+            return None
         return f"{self._name} has been frozen at {last:+.6g} {self._unit} for {unchanged:.1f} s"
 
 
@@ -128,10 +128,10 @@ class VoltageWatch:
         # Sums of differences from the first pair: so their squares lose no digits.
         self._origin = (0.0, 0.0)
         self._x = self._y = self._xx = self._yy = 0.0
-        self._suspect = ""
+        self._suspect: str | None = None
 
-    def add(self, pairs: Sequence[Pair], suspect: str) -> None:
-        """Add the pairs of a window, and the reason why it is suspect."""
+    def add(self, pairs: Sequence[Pair], suspect: str | None) -> None:
+        """Add the pairs of a window, and the reason why it is suspect, if it is."""
         for started, time, vx, vy, _ in pairs:
             if started >= self._started:
                 if not self._pairs:

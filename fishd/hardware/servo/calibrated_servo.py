@@ -43,8 +43,8 @@ class CalibratedServo:
         """Lowest and highest angle [rad] that soft limits and pulse widths permit."""
         return pulses.reach(self._settings)
 
-    def format_reach(self, amplitude: float) -> str:
-        """Return the part of ±Φ [rad] within `reach` as a text; empty if it is all of ±Φ."""
+    def format_reach(self, amplitude: float) -> str | None:
+        """Return the part of ±Φ [rad] within `reach` as a text; None if it is all of ±Φ."""
         return pulses.format_reach(self._settings, amplitude)
 
     def recalibrate(self, calibration: ServoCalibration) -> None:

@@ -43,8 +43,7 @@ class PigpioSettings(ServoSettings, frozen=True, forbid_unknown_fields=True, kw_
         unit(
             "s",
             "Time without a tick, at least three ticks, after which pigpiod takes the servo to "
-            "neutral and ends its pulses; fishd is then in fault if it continues. A longer time "
-            "tolerates a busy machine.",
+            "neutral and ends its pulses. A longer time tolerates a busy machine.",
             ge=0.1,
             le=2.0,
         ),
@@ -228,7 +227,7 @@ def _pigpiod(machine: Machine, settings: PigpioSettings) -> Result:
     """Check pigpiod through fishd's own client, which has a time limit for every step."""
     if not machine.is_virtual and "Raspberry Pi 5" in machine.model:
         return fail("pigpio does not work on a Pi 5", "set servo.driver: sysfs-pwm")
-    from fishd.hardware.servo.pigpio_client import MissingCommands, NotPigpiod, open_client
+    from fishd.hardware.servo.pigpio_client import MissingCommands, open_client
     from fishd.hardware.servo.pigpio_pulses import check_commands
 
     place = f"{settings.host}:{settings.port}"
@@ -240,53 +239,23 @@ def _pigpiod(machine: Machine, settings: PigpioSettings) -> Result:
             check_commands(client)
     except MissingCommands as error:
         return fail(str(error), "install pigpio 79, of 2021, or set servo.driver: sysfs-pwm")
-    except NotPigpiod as error:
-        return fail(str(error), _ANOTHER_PORT)
     except ServoError as error:
-        answers = any(word in str(error) for word in ("no answer", "it closed the connection"))
-        if machine.is_virtual:
+        text = str(error)
+        if machine.is_virtual and "not pigpiod: it" not in text:
             remedy = f"{START_VIRTUAL_PI}; its port must be that of servo.port"
-        elif not answers:
+        elif not any(word in text for word in ("no answer", "it closed", "not pigpiod")):
             remedy = _start_pigpiod(machine)
-        elif settings.host in _LOCAL_HOSTS and not _may_run_pigpiod(machine):
-            why = str(error).partition(f"{place}: ")[2].partition(": ")[0]
-            if _sees_all_processes(machine):
-                return fail(
-                    f"what answers at {place} is not pigpiod, of which there is no process: {why}",
-                    _ANOTHER_PORT,
-                )
-            return fail(
-                f"what answers at {place} is perhaps not pigpiod, of which no process is visible "
-                f"here: {why}",
-                f"if pigpiod runs outside of this container, restart it; else {_ANOTHER_PORT}",
-            )
         else:
-            remedy = f"sudo systemctl restart pigpiod; if another program is at {place}, stop it"
+            remedy = (
+                f"sudo systemctl restart pigpiod; if another program is at {place} ('sudo ss "
+                "-tlnp' names it), stop it, or start pigpiod at another port (-p) and set "
+                "servo.port"
+            )
         return fail(str(error), remedy)
     message = f"version {version} answers in {duration * 1e3:.2f} ms"
     if duration > SLOW_ANSWER_S:
         return warning(f"{message}: too slow for a tick", "find out what else loads this machine")
     return ok(message)
-
-
-_ANOTHER_PORT = (
-    "stop that program ('sudo ss -tlnp' names it), or start pigpiod at another port (-p) and set "
-    "servo.port"
-)
-
-
-def _may_run_pigpiod(machine: Machine) -> bool:
-    """Return whether a process is named pigpiod, or this user may not see all processes."""
-    names = {machine.text(f"/proc/{n.name}/comm") for n in machine.path("/proc").glob("[0-9]*")}
-    return "pigpiod" in names or not machine.text("/proc/1/comm")
-
-
-def _sees_all_processes(machine: Machine) -> bool:
-    """Return whether the processes of the whole machine are visible: those of the kernel are.
-
-    In a container they are not, even if its processes use the network of its host.
-    """
-    return machine.text("/proc/2/comm") == "kthreadd"
 
 
 def _start_pigpiod(machine: Machine) -> str:

@@ -23,11 +23,6 @@ MAX_SCRIPTS, SCRIPT_PARAMETERS = 32, 10
 
 _MAX_VERSION = 9999
 """Largest version that a pigpiod may have; it is 79 since 2021."""
-_PROVOCATION_S = 0.3
-"""Time that a silent server has for an answer to an empty line [s]."""
-_SHOWN_BYTES = 24
-"""Number of bytes of another server's answer that are shown."""
-
 _STANDSTILL_POLL_S = 5e-3
 """Period at which a wait in virtual time checks whether pigpiod stands still [s]."""
 
@@ -35,20 +30,10 @@ UNKNOWN_SCRIPT = pigpio.error_text(pigpio.PI_BAD_SCRIPT_ID)
 _SCRIPT_DELETED = "another program deleted fishd's script, as 'fishctl release' does"
 _SCRIPT_STATUS = 45
 _ANSWER = struct.Struct("<3Ii")
-_ECHO = struct.pack("<3I", pigpio._PI_CMD_PIGPV, 0, 0)
-"""First bytes of the answer to a request for the version."""
 
 
-class UnsuitableServer(ServoError):
-    """A server that cannot drive the servo; the text names its address."""
-
-
-class NotPigpiod(UnsuitableServer):
-    """Another server answers on the port of pigpiod."""
-
-
-class MissingCommands(UnsuitableServer):
-    """A pigpiod that is too old for the countdown."""
+class MissingCommands(ServoError):
+    """A pigpiod that is too old for the countdown; the text names its address."""
 
 
 class SilentServer(TimeoutError):
@@ -113,20 +98,6 @@ class TimedSocket:
         while self.unanswered:
             self._answer()
 
-    def provoke(self) -> bytes:
-        """Send an empty line to a silent server; return what arrives, until it cannot be pigpiod.
-
-        Servers of texts, such as HTTP, answer at the end of a line. A pigpiod ignores one when the
-        connection closes after it.
-        """
-        with contextlib.suppress(OSError):
-            self.deadline = time.monotonic() + _PROVOCATION_S
-            self._socket.settimeout(_PROVOCATION_S)
-            self._socket.sendall(b"\r\n\r\n")
-            while len(self._received) < len(_ECHO) and _ECHO.startswith(self._received):
-                self._fill(len(self._received) + 1)
-        return self.received
-
     @property
     def received(self) -> bytes:
         """Bytes that have arrived and belong to no complete answer."""
@@ -147,7 +118,9 @@ class TimedSocket:
         self._fill(_ANSWER.size)
         echo, _, _, result = _ANSWER.unpack_from(self._received)
         if echo != self.unanswered[0]:
-            raise ConnectionError(f"it answers command {echo} instead of {self.unanswered[0]}")
+            raise ConnectionError(
+                f"it is not pigpiod: it answers command {echo} instead of {self.unanswered[0]}"
+            )
         size = _ANSWER.size + (max(0, result) if echo == _SCRIPT_STATUS else 0)
         self._fill(size)
         answer = bytes(self._received[:size])
@@ -197,7 +170,6 @@ class Client(pigpio.pi):  # type: ignore[misc]
         self, host: str, port: int, limit: float, standstill: Callable[[], bool] | None = None
     ) -> None:
         """Connect within `limit` [s]; raise OSError. `standstill` is that of `TimedSocket`."""
-        self._host, self._port = host, port
         self.place = pigpiod_at(host, port)
         """Name of this pigpiod in messages."""
         self._notify = None
@@ -207,29 +179,21 @@ class Client(pigpio.pi):  # type: ignore[misc]
         self.connected = True
 
     def identify(self) -> int:
-        """Return the version of pigpiod; raise OSError, or `NotPigpiod` for another server."""
+        """Return the version of pigpiod; raise OSError, also for another server."""
         try:
             version = int(self.get_pigpio_version())
-        except OSError as error:
-            is_silent = isinstance(error, TimeoutError)
-            answer = self._socket.provoke() if is_silent else self._socket.received
-            if not _ECHO.startswith(answer[: len(_ECHO)]):
-                shown = repr(answer[:_SHOWN_BYTES])[1:]
-                raise self._not_pigpiod(f"it sends {shown}") from None
-            if is_silent:
-                raise SilentServer from None
-            if isinstance(error, ConnectionError) and not answer:
-                raise ConnectionError(
-                    "it closed the connection at once: it is not pigpiod, or its option -n does "
-                    "not permit this address"
-                ) from None
-            raise
+        except TimeoutError:
+            raise SilentServer from None
+        except ConnectionError:
+            if self._socket.received:
+                raise
+            raise ConnectionError(
+                "it closed the connection at once: it is not pigpiod, or its option -n does not "
+                "permit this address"
+            ) from None
         if not 0 < version <= _MAX_VERSION:  # 0 is sent by a server that returns what it receives
-            raise self._not_pigpiod(f"it says that its version is {version}")
+            raise ConnectionError(f"it is not pigpiod: it says that its version is {version}")
         return version
-
-    def _not_pigpiod(self, why: str) -> NotPigpiod:
-        return NotPigpiod(f"what answers at {self._host}:{self._port} is not pigpiod: {why}")
 
     @property
     def unanswered(self) -> int:
@@ -282,7 +246,7 @@ def open_client(host: str, port: int, limit: float = ANSWER_TIMEOUT_S) -> Iterat
         client.identify()
         client.within(limit)
         yield client
-    except UnsuitableServer:
+    except MissingCommands:
         raise
     except COMMAND_ERRORS as error:
         raise ServoError(f"{pigpiod_at(host, port)}: {describe_error(error, limit)}") from None

@@ -11,7 +11,7 @@ from fishd.hardware.servo.pigpio_client import (
     ANSWER_TIMEOUT_S,
     COMMAND_ERRORS,
     Client,
-    UnsuitableServer,
+    MissingCommands,
     describe_error,
     pigpiod_at,
 )
@@ -187,7 +187,7 @@ class PigpioLink:
             self._prepare(client)
         except BaseException as error:
             why = describe_error(error, limit)
-            is_named = isinstance(error, UnsuitableServer)
+            is_named = isinstance(error, MissingCommands)
             self._trouble = why if is_named else f"{self._where}: not connected: {why}"
             if client:
                 client.close()

@@ -53,45 +53,25 @@ _READ_BACKS, _READ_BACK_S = 10, 0.1
 _LEVEL_READS, _LEVEL_READ_S = 130, 4e-4
 """Number of reads of a pin's level, and time between them [s]; together they cover two frames."""
 
-_SCRIPT_COMMANDS = {
-    "PROC": pigpio._PI_CMD_PROC,
-    "PROCD": pigpio._PI_CMD_PROCD,
-    "PROCP": pigpio._PI_CMD_PROCP,
-    "PROCR": pigpio._PI_CMD_PROCR,
-    "PROCU": pigpio._PI_CMD_PROCU,
-}
-_PIN_COMMANDS = {
-    "SERVO": pigpio._PI_CMD_SERVO,
-    "GPW": pigpio._PI_CMD_GPW,
-    "GDC": pigpio._PI_CMD_GDC,
-    "MODEG": pigpio._PI_CMD_MODEG,
-    "READ": pigpio._PI_CMD_READ,
-}
-"""Commands of pigpiod that fishd needs, by the names of `pigs`."""
 _NOTHING = 99
-"""Number that neither a script nor a GPIO has."""
+"""Number that no script has."""
 
 Sleep = Callable[[float], None]
 
 
 def check_commands(client: Client) -> None:
-    """Raise `MissingCommands` unless pigpiod knows all commands that fishd needs."""
-    if missing := missing_commands(client, _SCRIPT_COMMANDS | _PIN_COMMANDS):
+    """Raise `MissingCommands` unless pigpiod knows the newest command that a countdown needs."""
+    if not knows_updates(client):
         raise MissingCommands(
             f"{client.place} is version {client.get_pigpio_version()}, too old: it does not know "
-            f"{', '.join(missing)}, which the countdown needs"
+            "PROCU, which the countdown needs"
         )
 
 
-def missing_commands(client: Client, commands: dict[str, int]) -> list[str]:
-    """Return those commands that pigpiod does not know; none of them has an effect here."""
-    missing = []
-    for name, number in commands.items():
-        text = b"?" if name == "PROC" else b""  # not a script, so it is refused
-        result = pigpio._pigpio_command_ext(client.sl, number, _NOTHING, 0, len(text), [text])
-        if pigpio.u2i(result) == pigpio.PI_UNKNOWN_COMMAND:
-            missing.append(name)
-    return missing
+def knows_updates(client: Client) -> bool:
+    """Return whether pigpiod can update scripts; what is sent here has no effect."""
+    result = pigpio._pigpio_command_ext(client.sl, pigpio._PI_CMD_PROCU, _NOTHING, 0, 0, [b""])
+    return bool(pigpio.u2i(result) != pigpio.PI_UNKNOWN_COMMAND)
 
 
 def countdown_counts(countdown: float, tick: float) -> int:
@@ -203,7 +183,7 @@ def neutralise(
 
 
 def _neutralise(client: Client, gpio: int, neutral: float, sleep: Sleep) -> bool:
-    has_scripts = not missing_commands(client, _SCRIPT_COMMANDS)
+    has_scripts = knows_updates(client)
     scripts = find_countdowns(client, gpio, ANSWER_TIMEOUT_S) if has_scripts else []
     energised = _pulses_on(client, gpio, sleep)
     if energised:

@@ -52,14 +52,14 @@ def pulse_reach(servo: "ServoSettings") -> tuple[float, float]:
     return lowest, highest
 
 
-def format_reach(servo: "ServoSettings", amplitude: float) -> str:
-    """Return the part of ±Φ within `reach` as a text; empty if it is all of ±Φ.
+def format_reach(servo: "ServoSettings", amplitude: float) -> str | None:
+    """Return the part of ±Φ within `reach` as a text; None if it is all of ±Φ.
 
     amplitude: Φ [rad]
     An example of the text is `-0.3 to +0.42 rad of ±0.42 rad`.
     """
     lowest, highest = reach(servo)
     if lowest <= -amplitude + ANGLE_TOLERANCE_RAD and amplitude - ANGLE_TOLERANCE_RAD <= highest:
-        return ""
+        return None
     part = (max(lowest, -amplitude), min(highest, amplitude))
     return f"{part[0]:+.4g} to {part[1]:+.4g} rad of ±{amplitude:g} rad"

@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from fishd.core.errors import ServoError
 from fishd.hardware.servo.pulses import NEUTRAL_TIME_S
@@ -34,28 +34,6 @@ READ_BACK_S = 0.1
 """Time within which another program that drives the channel writes again [s]."""
 
 
-class Files(Protocol):
-    """Functions of module `os` that a channel needs; an emulated kernel has them too."""
-
-    def open(self, path: str, flags: int, /) -> int:
-        """Do as os.open."""
-
-    def pread(self, fd: int, length: int, offset: int, /) -> bytes:
-        """Do as os.pread."""
-
-    def pwrite(self, fd: int, data: bytes, offset: int, /) -> int:
-        """Do as os.pwrite."""
-
-    def close(self, fd: int, /) -> None:
-        """Do as os.close."""
-
-    def listdir(self, path: str, /) -> list[str]:
-        """Do as os.listdir."""
-
-    def readlink(self, path: str, /) -> str:
-        """Do as os.readlink."""
-
-
 class Wires(NamedTuple):
     """Pin and PWM channel that a servo is wired to."""
 
@@ -68,24 +46,18 @@ class Wires(NamedTuple):
     """Channel of the chip; None for the channel that the pin is wired to."""
 
 
-class Clock(Protocol):
-    """Clock: one of fishd's, or module `time`."""
-
-    def monotonic(self) -> float:
-        """Do as time.monotonic."""
-
-    def sleep(self, seconds: float, /) -> None:
-        """Do as time.sleep."""
-
-
 class PwmChannel:
     """One channel; each method raises `ServoError` with one line that gives the remedy."""
 
     NAMES = ("period", "duty_cycle", "enable")
     """Names of the files with a number: two times [ns], and 1 for on."""
 
-    def __init__(self, servo: Wires, clock: Clock, files: Files = os) -> None:
-        """Store the arguments; `open` finds the channel."""
+    def __init__(self, servo: Wires, clock: Any, files: Any = os) -> None:
+        """Store the arguments; `open` finds the channel.
+
+        clock: one of fishd's, or module `time`
+        files: module `os`, or an emulated kernel with its functions
+        """
         self._servo = servo
         self._files = files
         self._clock = clock
@@ -195,7 +167,8 @@ class PwmChannel:
             try:
                 if wanted:
                     self._files.pwrite(fd, wanted, 0)
-                return self._files.pread(fd, 32, 0).strip()
+                polarity: bytes = self._files.pread(fd, 32, 0).strip()
+                return polarity
             finally:
                 self._files.close(fd)
         except FileNotFoundError:
@@ -307,7 +280,7 @@ def _explain(path: str, error: OSError) -> ServoError:
 
 
 def neutralise(
-    neutral: float, *, frequency: float, files: Files = os, clock: Clock = time, **wires: Any
+    neutral: float, *, frequency: float, files: Any = os, clock: Any = time, **wires: Any
 ) -> bool:
     """Send neutral [µs] for 0.3 s and end the pulses; return False if there are none.
 

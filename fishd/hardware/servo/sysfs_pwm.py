@@ -14,7 +14,7 @@ from fishd.core.errors import ServoError
 from fishd.core.schema import note, unit
 from fishd.hardware.checks import Check, Machine, Result, fail, ok, warning
 from fishd.hardware.driver import Claim, LastResort, ServoDriver, pin
-from fishd.hardware.servo.pwm_pulses import UDEV_TIMEOUT_S, Files, PwmChannel, Wires
+from fishd.hardware.servo.pwm_pulses import UDEV_TIMEOUT_S, PwmChannel, Wires
 from fishd.hardware.settings import Gpio, ServoSettings
 
 
@@ -51,7 +51,7 @@ class SysfsPwm(ServoDriver[SysfsPwmSettings]):
 
     Settings = SysfsPwmSettings
 
-    def __init__(self, *given: Any, files: Files = os, **named: Any) -> None:
+    def __init__(self, *given: Any, files: Any = os, **named: Any) -> None:
         """Do as `ServoDriver`.
 
         files: functions that access the channel's files, by default those of this machine

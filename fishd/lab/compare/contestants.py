@@ -11,9 +11,9 @@ from fishd.camera.simulated import SimulatedCameraSettings, SimulatedSight
 from fishd.config import Config
 from fishd.controllers import registry
 from fishd.controllers.base import Controller, Limits
-from fishd.controllers.policy import file, library, opening
+from fishd.controllers.policy import file, library
 from fishd.controllers.policy.controller import PpoParameters
-from fishd.controllers.policy.pilot import Pilot
+from fishd.controllers.policy.runtime import Pilot
 from fishd.core import files
 from fishd.core.errors import FishdError, ParameterError, PolicyError, UnknownController
 from fishd.core.schema import names_file, parse_value, suggest
@@ -32,7 +32,10 @@ def sees_pictures(policy: Any, limits: Limits) -> bool:
     policy: name or path of the policy
     """
     try:
-        return isinstance(policy, str) and opening.read(policy, limits).card.pictures is not None
+        return (
+            isinstance(policy, str)
+            and library.open_policy(policy, limits).card.pictures is not None
+        )
     except PolicyError:
         return False
 

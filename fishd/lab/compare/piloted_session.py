@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from fishd.camera.live_sight import LiveSight
 from fishd.client import Agent, Fish
 from fishd.controllers.base import Limits
-from fishd.controllers.policy.pilot import Pilot
+from fishd.controllers.policy.runtime import Pilot
 from fishd.core.errors import FishdError, PolicyError
 from fishd.core.signals import Tick
 from fishd.lab.compare.contestants import sees_pictures

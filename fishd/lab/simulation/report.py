@@ -130,7 +130,7 @@ def judge(
 
     publisher: receiver of every tick and event; None to create no messages
     on_start: called before the first tick
-    Raises `ParameterError` where `settle` is too long, and `ConfigError` for a free swimmer.
+    Raises `ParameterError` where `settle` is too long, and `ConfigError` for a free fish.
     """
     check_tethered(config.robot, "relative_thrust")
     ticks, first = count_ticks(seconds, settle, config.tick)

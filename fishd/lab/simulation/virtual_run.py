@@ -69,11 +69,9 @@ class VirtualRun:
         self.config = config
         clock = VirtualClock()
         with ExitStack() as stack:
-            fish = open_fish_in_virtual_time(config, stack)
-            self.swimmer = fish.swimmer
-            """The free swimmer; None for a tethered fish."""
-            self._take_window = fish.take_window
-            self.loop = build_loop(config, fish.robot, clock, publisher)
+            robot, self.fish = open_fish_in_virtual_time(config, stack)
+            """The fish itself, as `RobotKind.open` describes it."""
+            self.loop = build_loop(config, robot, clock, publisher)
             stack.callback(self.loop.close)
             self._stack = stack.pop_all()
         self._slots = virtual_slots(clock, config.tick)
@@ -112,7 +110,8 @@ class VirtualRun:
     def tick(self) -> TrueWindow:
         """Run one tick; return the true motion between its read and the one before."""
         self.loop.tick(next(self._slots))
-        return self._take_window()
+        window: TrueWindow = self.fish.take_window()
+        return window
 
 
 def check_length(what: str, seconds: float) -> None:

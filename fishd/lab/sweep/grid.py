@@ -59,9 +59,9 @@ class Lengths(Struct, frozen=True):
     """Duration for which a simulated fish swims at each point."""
 
     settle: float = 10.0
-    """Time at the start that is not measured [s]; a free swimmer may need longer."""
+    """Time at the start that is not measured [s]; a free fish may need longer."""
     periods: int = 20
-    """Number of measured tail beats; for a free swimmer, the smallest number."""
+    """Number of measured tail beats; for a free fish, the smallest number."""
 
     @classmethod
     def of(cls, config: Config, settle: float | None, periods: int | None) -> "Lengths":

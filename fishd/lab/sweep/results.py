@@ -1,4 +1,4 @@
-"""Result at each point of a sweep, a thrust or the speed of a free swimmer, and their folder."""
+"""Result at each point of a sweep, a thrust or the speed of a free fish, and their folder."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

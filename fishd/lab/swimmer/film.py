@@ -42,14 +42,14 @@ This bounds the memory of a long run: a frame needs 0.13 MB.
 COLUMNS = 600
 _FOOTER_HEIGHT = 26
 """Height of the line of text below the water [pixels]."""
-_LEVELS, _SHADES = 84, 3
-"""Number of colours of the water, and of mixtures of each with the body's colour at its edge."""
 _INK = (64, 64, 64)
 _PAPER = (255, 255, 255)
 _OVERSAMPLING = 3
 """Factor by which the body is painted larger first, for smooth edges."""
 _QUALITY = 60
 _FONT_SIZE = 12
+_BAR_LENGTH, _BAR_HEIGHT = 90, 12
+"""Size of the bar of colours [pixels]."""
 
 
 class Film:
@@ -71,6 +71,7 @@ class Film:
         self._quantity: Quantity = quantity
         self._window = window_around(settings)
         self._limit = choose_colour_limit(settings, quantity)
+        self._low = -self._limit if quantity in SIGNED_QUANTITIES else 0.0
         self._frames: list[Image.Image] = []
         self._times: list[float] = []
         self._stride = 1
@@ -103,87 +104,61 @@ class Film:
             self._stride *= 2
 
     def _paint(self, scene: View) -> "Image.Image":
-        """Return a frame: each pixel is a colour of the water, mixed with ink."""
-        from PIL import Image
-
-        low = -self._limit if self._quantity in SIGNED_QUANTITIES else 0.0
-        share = (scene.values[::-1] - low) / (self._limit - low)
-        water = np.clip(np.rint(share * (_LEVELS - 1)), 0, _LEVELS - 1).astype(np.uint8)
-        foot, ink_below = self._paint_footer(scene)
-        ink = np.concatenate([self._paint_body(scene, water.shape), ink_below])
-        level = np.concatenate([water, foot])
-        pixels = np.where(ink < _SHADES, _LEVELS * ink + level, _LEVELS * _SHADES)
-        paper = (level == _LEVELS) & (ink < _SHADES)
-        pixels[paper] = _LEVELS * _SHADES + 1 + ink[paper]
-        frame = Image.fromarray(pixels.astype(np.uint8))
-        frame.putpalette(self._palette)
-        return frame
-
-    def _paint_body(self, scene: View, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-        """Return the share of the body in each pixel, 0 to `_SHADES`."""
+        """Return a frame: the water, the body in it, and a line of text below."""
         from PIL import Image, ImageDraw
 
-        rows, columns = shape
+        water = self._colour(scene.values[::-1])
+        rows, columns, _ = water.shape
+        frame = Image.new("RGB", (columns, rows + _FOOTER_HEIGHT), _PAPER)
+        frame.paste(Image.fromarray(water))
         mask = Image.new("L", (_OVERSAMPLING * columns, _OVERSAMPLING * rows))
         window = scene.window
         pixels = _OVERSAMPLING * columns / (window.right - window.left)
         x = (scene.outline[:, 0] - window.left) * pixels
         y = (window.top - scene.outline[:, 1]) * pixels
         ImageDraw.Draw(mask).polygon(list(zip(x.tolist(), y.tolist(), strict=True)), fill=255)
-        return _to_shades(mask.reduce(_OVERSAMPLING))
+        frame.paste(_INK, mask=mask.reduce(_OVERSAMPLING))
+        self._draw_footer(frame, scene, rows + _FOOTER_HEIGHT // 2)
+        return frame.quantize()  # a third of the memory
 
-    def _paint_footer(self, scene: View) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Return the colours (`_LEVELS` is paper) and the ink of the line below the water."""
+    def _colour(self, values: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Return the colours of values, shape (rows, columns, 3)."""
+        load_matplotlib()
+        from matplotlib import colormaps
+
+        share = (values - self._low) / (self._limit - self._low)
+        colours: NDArray[np.uint8] = colormaps[COLOURS[self._quantity]](share, bytes=True)[..., :3]
+        return colours
+
+    def _draw_footer(self, frame: "Image.Image", scene: View, middle: int) -> None:
+        """Draw time, speed, place, a scale, and the colours of the water; middle: row [pixels]."""
         from PIL import Image, ImageDraw
 
-        colours = np.full((_FOOTER_HEIGHT, COLUMNS), _LEVELS, np.uint8)
-        mask = Image.new("L", (COLUMNS, _FOOTER_HEIGHT))
-        draw = ImageDraw.Draw(mask)
-        window = scene.window
-        width = window.right - window.left
+        draw = ImageDraw.Draw(frame)
+        width = scene.window.right - scene.window.left
         length = round_number(0.1 * width)
         pixels = round(length / width * COLUMNS)
 
         def write(x: float, content: str, anchor: str = "lm") -> None:
-            draw.text((x, 0.5 * _FOOTER_HEIGHT), content, fill=255, font=self._font, anchor=anchor)
+            draw.text((x, middle), content, fill=_INK, font=self._font, anchor=anchor)
 
         write(8, f"{scene.time:.2f} s")
         write(70, f"{1e3 * scene.speed:.0f} mm/s")
         write(150, f"x = {100.0 * scene.x:.1f} cm")
-        draw.line(
-            [(262, _FOOTER_HEIGHT // 2), (262 + pixels, _FOOTER_HEIGHT // 2)], fill=255, width=3
-        )
+        draw.line([(262, middle), (262 + pixels, middle)], fill=_INK, width=3)
         write(270 + pixels, f"{100.0 * length:g} cm")
-        right = COLUMNS - 8
-        unit = UNITS[self._quantity]
-        low = f"{-self._limit:g}" if self._quantity in SIGNED_QUANTITIES else "0"
-        write(right, f"{self._limit:g} {unit}", "rm")
-        right -= 8 + round(draw.textlength(f"{self._limit:g} {unit}", font=self._font))
-        bar = np.linspace(0, _LEVELS - 1, 90).astype(np.uint8)
-        colours[7:-7, right - len(bar) : right] = bar
-        write(right - len(bar) - 8, f"{self._quantity} {low}", "rm")
-        return colours, _to_shades(mask)
+        right, limit = COLUMNS - 8, f"{self._limit:g} {UNITS[self._quantity]}"
+        write(right, limit, "rm")
+        right -= 8 + round(draw.textlength(limit, font=self._font)) + _BAR_LENGTH
+        bar = np.linspace(self._low, self._limit, _BAR_LENGTH)[None].repeat(_BAR_HEIGHT, axis=0)
+        frame.paste(Image.fromarray(self._colour(bar)), (right, middle - _BAR_HEIGHT // 2))
+        write(right - 8, f"{self._quantity} {self._low:g}", "rm")
 
     @cached_property
     def _font(self) -> Any:
         from PIL import ImageFont
 
         return ImageFont.load_default(_FONT_SIZE)
-
-    @cached_property
-    def _palette(self) -> list[int]:
-        """Palette of the frames: water and its mixtures with ink; ink; paper and its mixtures."""
-        load_matplotlib()
-        from matplotlib import colormaps
-
-        shares = np.linspace(0.0, 1.0, _LEVELS)
-        water = 255.0 * colormaps[COLOURS[self._quantity]](shares)[:, :3]
-        ink, paper = np.array([_INK], float), np.array([_PAPER], float)
-        mixes = [(1.0 - k / _SHADES, k / _SHADES) for k in range(_SHADES)]
-        parts = [a * water + b * ink for a, b in mixes]
-        parts += [ink, *(a * paper + b * ink for a, b in mixes)]
-        colours = np.rint(np.concatenate(parts)).astype(int)
-        return [int(value) for value in colours.reshape(-1)]
 
     def _write(self) -> None:
         if not self._frames:
@@ -221,7 +196,3 @@ def check(path: str | os.PathLike[str]) -> None:
         raise FishdError(
             f"{file}: the film cannot be written: the folder {file.parent} does not exist"
         )
-
-
-def _to_shades(mask: "Image.Image") -> NDArray[np.uint8]:
-    return np.rint(np.asarray(mask) / 255.0 * _SHADES).astype(np.uint8)

@@ -13,6 +13,7 @@ from typing import Annotated, Any, NamedTuple
 
 import msgspec
 from msgspec import Meta, Struct
+from scipy.optimize import brentq
 
 from fishd.config import Config
 from fishd.core import files
@@ -102,10 +103,7 @@ def _observed_order(grids: Sequence[GridSpeed]) -> float | None:
     low, high = 1e-3, 10.0
     if excess(low) > 0.0 or excess(high) < 0.0:
         return None
-    for _ in range(60):
-        order = 0.5 * (low + high)
-        low, high = (order, high) if excess(order) < 0.0 else (low, order)
-    return order
+    return float(brentq(excess, low, high))
 
 
 def choose_grids(config: Config, count: int) -> list[tuple[float, float]]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import interpn
 
 from fishd.lab.drawing import BLACK, open_figure
 from fishd.virtual.swimmer.checkpoint import Checkpoint, CheckpointError
@@ -155,19 +156,8 @@ def _read_quantity(fish: Fish, quantity: Quantity) -> tuple[Array, Array, Array]
 
 def _interpolate(values: Array, at_x: Array, at_y: Array, x: Positions, y: Positions) -> Array:
     """Return bilinear interpolations of a grid; beyond its ends, the values at the ends."""
-    i, s = _locate(at_x, x)
-    j, t = _locate(at_y, y)
-    s, t = s[:, None], t[None, :]
-    left = (1.0 - t) * values[np.ix_(i, j)] + t * values[np.ix_(i, j + 1)]
-    right = (1.0 - t) * values[np.ix_(i + 1, j)] + t * values[np.ix_(i + 1, j + 1)]
-    return np.asarray((1.0 - s) * left + s * right)
-
-
-def _locate(nodes: Array, places: Positions) -> tuple[NDArray[np.intp], Positions]:
-    """Return the node before each position, and the fraction of the way to the next, 0 to 1."""
-    first = np.clip(np.searchsorted(nodes, places) - 1, 0, len(nodes) - 2)
-    share = (places - nodes[first]) / (nodes[first + 1] - nodes[first])
-    return first, np.clip(share, 0.0, 1.0)
+    places = np.clip(x, at_x[0], at_x[-1]), np.clip(y, at_y[0], at_y[-1])
+    return np.asarray(interpn((at_x, at_y), values, tuple(np.meshgrid(*places, indexing="ij"))))
 
 
 def draw_wake(scene: View, limit: float, path: str | os.PathLike[str]) -> None:

@@ -1,6 +1,7 @@
 """Evaluations without exploration on a simulated fish; `swims` has those in a tank."""
 
 import itertools
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -129,40 +130,27 @@ def worst_on_others(
     range policies swim as in `ppo`, with the shortest dwell; the relative thrust of a policy that
     continues to reverse faster is 0.
     """
-    swim = _swim_at_edge if settings.evaluation.others_from == "edges" else _swim_in_range
-    seeds = range(settings.evaluation.others)
-    return min(swim(config, decide, settings, camera, seed) for seed in seeds)
+    lengths, spread = settings.evaluation, settings.randomisation
+    lowest = math.inf
+    for seed in range(lengths.others):
+        if lengths.others_from == "edges":
+            fish, swim = draw_edge_fish(config, spread, seed), _shake_first(decide, config)
+        else:
+            fish = draw_fish(config, spread, seed)
+            swim = _limit_dwell(decide, fish)
+        report = judge(fish, swim, lengths.seconds, lengths.settle, camera)
+        lowest = min(lowest, 0.0 if report.fallback else report.relative_thrust)
+    return lowest
 
 
-def _swim_at_edge(
-    config: Config,
-    decide: Decide,
-    settings: TrainingSettings,
-    camera: Camera | None,
-    seed: int,
-) -> float:
-    fish, lengths = draw_edge_fish(config, settings.randomisation, seed), settings.evaluation
-    return judge(
-        fish, _shake_first(decide, config), lengths.seconds, lengths.settle, camera
-    ).relative_thrust
-
-
-def _swim_in_range(
-    config: Config,
-    decide: Decide,
-    settings: TrainingSettings,
-    camera: Camera | None,
-    seed: int,
-) -> float:
-    fish, lengths = draw_fish(config, settings.randomisation, seed), settings.evaluation
-    limits = fish.limits
-    limit = DwellLimit(limits.dwell, limits, fish.amplitude_limit)
+def _limit_dwell(decide: Decide, fish: Config) -> Decide:
+    """Return a policy with the shortest dwell of a fish, as in `ppo`."""
+    limit = DwellLimit(fish.limits.dwell, fish.limits, fish.amplitude_limit)
 
     def decide_limited(observation: Observation, stack: Stack | None) -> float:
         return limit.apply(decide(observation, stack), observation.dt)
 
-    report = judge(fish, decide_limited, lengths.seconds, lengths.settle, camera)
-    return 0.0 if report.fallback else report.relative_thrust
+    return decide_limited
 
 
 def beat_frequency(shares: NDArray[np.float64], tick: float) -> float:

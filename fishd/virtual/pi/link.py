@@ -27,54 +27,11 @@ ANSWER_MARGIN_S = 1.0
 """Time that the client waits for an answer beyond the timeout of the bus [s]."""
 
 
-class Request(Struct, frozen=True, tag=True, array_like=True):
-    """Base class of requests."""
+class Call(Struct, frozen=True, array_like=True):
+    """Request for one operation of `LinkServer`, by its name."""
 
-
-class Transfer(Request, frozen=True):
-    """Request for one I2C transfer; the reply contains the bytes of each read."""
-
-    address: int
-    messages: tuple[bytes | int, ...]
-    """Bytes to write, or the number of bytes to read."""
-    asked: float
-    """Time of the request [s, monotonic clock]."""
-
-
-class SetTimeout(Request, frozen=True):
-    """Request that sets the time after which the kernel gives up on a hanging bus [s]."""
-
-    seconds: float
-
-
-class Inject(Request, frozen=True):
-    """Request that starts a fault."""
-
-    name: str
-    seconds: float | None
-
-
-class Clear(Request, frozen=True):
-    """Request that ends a fault; None: all faults."""
-
-    name: str | None
-
-
-class SetLevel(Request, frozen=True):
-    """Request that drives an input pin low or high from outside; None: not driven."""
-
-    gpio: int
-    level: int | None
-
-
-class AwaitLevels(Request, frozen=True):
-    """Request for the pins driven from outside, answered when they differ from `known`."""
-
-    known: dict[int, int]
-
-
-class GetState(Request, frozen=True):
-    """Request for a `PiState`."""
+    operation: str
+    arguments: tuple[Any, ...] = ()
 
 
 class Done(Struct, frozen=True, tag=True, array_like=True):
@@ -88,9 +45,6 @@ class Failed(Struct, frozen=True, tag=True, array_like=True):
 
     errno: int
     message: str
-
-
-AnyRequest = Transfer | SetTimeout | Inject | Clear | SetLevel | AwaitLevels | GetState
 
 
 class RemotePi:
@@ -121,34 +75,34 @@ class RemotePi:
     def transfer(self, address: int, messages: Sequence[Message]) -> list[bytes]:
         """Perform one I2C transfer, and return the bytes of each read; raises OSError."""
         encoded = tuple(m.data if isinstance(m, Write) else m.length for m in messages)
-        replies: list[bytes] = self._request(Transfer(address, encoded, time.monotonic()))
+        replies: list[bytes] = self._call("transfer", address, encoded, time.monotonic())
         return replies
 
     def set_timeout(self, seconds: float) -> None:
         """Set the kernel's timeout for a hanging bus [s], also after a reconnect."""
         self._timeout = seconds
-        self._request(SetTimeout(seconds))
+        self._call("set_timeout", seconds)
 
     def inject(self, name: str, seconds: float | None = None) -> None:
         """Start a fault, for a time [s] or until it is cleared; raises ValueError if unknown."""
-        self._request(Inject(name, seconds))
+        self._call("inject", name, seconds)
 
     def clear(self, name: str | None = None) -> None:
         """End a fault, or all faults; raises ValueError if unknown."""
-        self._request(Clear(name))
+        self._call("clear", name)
 
     def set_level(self, gpio: int, level: int | None) -> None:
         """Drive an input pin low or high from outside; None stops driving it."""
-        self._request(SetLevel(gpio, level))
+        self._call("set_level", gpio, level)
 
     def await_levels(self, known: dict[int, int]) -> dict[int, int]:
         """Return the pins driven from outside when they differ from `known`, or after a timeout."""
-        levels: dict[int, int] = self._request(AwaitLevels(known))
+        levels: dict[int, int] = self._call("await_levels", known)
         return levels
 
     def state(self) -> PiState:
         """Return the state of the virtual Pi."""
-        return msgspec.convert(self._request(GetState()), PiState)
+        return msgspec.convert(self._call("state"), PiState)
 
     def close(self) -> None:
         """Disconnect, even while another thread waits; may be called twice."""
@@ -165,16 +119,16 @@ class RemotePi:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _request(self, request: Request) -> Any:
+    def _call(self, operation: str, *arguments: Any) -> Any:
         with self._lock:
-            reply = self._exchange(request)
+            reply = self._exchange(Call(operation, arguments))
         if isinstance(reply, Failed):
             if reply.errno:
                 raise OSError(reply.errno, reply.message)
             raise ValueError(reply.message)
         return reply.value
 
-    def _exchange(self, request: Request) -> Done | Failed:
+    def _exchange(self, request: Call) -> Done | Failed:
         try:
             connection = self._socket or self._connect()
             connection.settimeout((self._timeout or KERNEL_TIMEOUT) + ANSWER_MARGIN_S)
@@ -202,7 +156,7 @@ class RemotePi:
             connection.settimeout(ANSWER_MARGIN_S)
             connection.connect(str(self._path))
             if self._timeout is not None:
-                connection.send(self._encode(SetTimeout(self._timeout)))
+                connection.send(self._encode(Call("set_timeout", (self._timeout,))))
                 connection.recv(MAX_PACKET_BYTES)
         except OSError:
             connection.close()

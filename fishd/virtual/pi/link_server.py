@@ -5,6 +5,7 @@ import errno
 import os
 import socket
 import threading
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -14,19 +15,7 @@ import msgspec
 from fishd.core.errors import StartupError
 from fishd.core.process.unix_sockets import bind, claim_socket
 from fishd.virtual.pi.i2c import Message, Read, Write
-from fishd.virtual.pi.link import (
-    LONG_POLL_TIMEOUT_S,
-    MAX_PACKET_BYTES,
-    AnyRequest,
-    AwaitLevels,
-    Clear,
-    Done,
-    Failed,
-    Inject,
-    SetLevel,
-    SetTimeout,
-    Transfer,
-)
+from fishd.virtual.pi.link import LONG_POLL_TIMEOUT_S, MAX_PACKET_BYTES, Call, Done, Failed
 from fishd.virtual.pi.virtual_pi import VirtualPi
 
 
@@ -36,6 +25,15 @@ class LinkServer:
     def __init__(self, pi: VirtualPi, path: Path) -> None:
         self._pi = pi
         self._path = path
+        self._operations: dict[str, Callable[..., Any]] = {
+            "transfer": self._transfer,
+            "set_timeout": self._set_timeout,
+            "inject": pi.faults.inject,
+            "clear": pi.faults.clear,
+            "set_level": pi.set_level,
+            "await_levels": lambda known: pi.levels(known, LONG_POLL_TIMEOUT_S),
+            "state": pi.state,
+        }
         self._connections: dict[socket.socket, threading.Thread] = {}
         self._lock = threading.Lock()
         self._stack = ExitStack()
@@ -96,7 +94,7 @@ class LinkServer:
             thread.join()
 
     def _serve(self, connection: socket.socket) -> None:
-        decode = msgspec.msgpack.Decoder(AnyRequest).decode
+        decode = msgspec.msgpack.Decoder(Call).decode
         encode = msgspec.msgpack.Encoder().encode
         with connection:
             try:
@@ -110,33 +108,22 @@ class LinkServer:
                 with self._lock:
                     del self._connections[connection]
 
-    def _answer(self, decode: Any, packet: bytes) -> Done | Failed:
+    def _answer(self, decode: Callable[[bytes], Call], packet: bytes) -> Done | Failed:
         try:
-            return Done(self._perform(decode(packet)))
+            call = decode(packet)
+            return Done(self._operations[call.operation](*call.arguments))
         except OSError as error:
             number = error.errno or errno.EIO
             return Failed(number, error.strerror or os.strerror(number))
-        except (ValueError, msgspec.MsgspecError) as error:
+        except (ValueError, TypeError, LookupError, msgspec.MsgspecError) as error:
             return Failed(0, str(error))
 
-    def _perform(self, request: AnyRequest) -> Any:
-        pi = self._pi
-        match request:
-            case Transfer(address, messages, asked):
-                return pi.bus.transfer(address, [_message(encoded) for encoded in messages], asked)
-            case SetTimeout(seconds):
-                pi.bus.timeout = seconds
-            case Inject(name, seconds):
-                pi.faults.inject(name, seconds)
-            case Clear(name):
-                pi.faults.clear(name)
-            case SetLevel(gpio, level):
-                pi.set_level(gpio, level)
-            case AwaitLevels(known):
-                return pi.levels(known, LONG_POLL_TIMEOUT_S)
-            case _:
-                return pi.state()
-        return None
+    def _transfer(self, address: int, messages: list[bytes | int], asked: float) -> list[bytes]:
+        """Perform a transfer; messages: bytes to write, or the number of bytes to read."""
+        return self._pi.bus.transfer(address, [_message(encoded) for encoded in messages], asked)
+
+    def _set_timeout(self, seconds: float) -> None:
+        self._pi.bus.timeout = seconds
 
 
 def _message(encoded: bytes | int) -> Message:

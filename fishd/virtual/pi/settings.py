@@ -53,9 +53,8 @@ class VirtualPiSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
         Annotated[float, Meta(ge=0, le=10)] | None,
         unit(
             "s",
-            "Time constant of a resistor from the servo's pin to A0, with a capacitor from A0 to "
-            "ground, for 'fishctl doctor --bench'; they replace the amplifier at A0. 0: a bare "
-            "wire; null: the amplifier.",
+            "Time constant of the filter from the servo's pin to A0, for 'fishctl doctor --bench'. "
+            "0: a bare wire; null: the amplifier of the force sensor.",
         ),
     ] = None
     power_meter: Annotated[

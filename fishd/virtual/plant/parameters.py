@@ -95,8 +95,7 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "rad",
-            "Play of the tail relative to the wheel, in either direction: after a reversal, the "
-            "wheel turns by twice the play before the tail follows.",
+            "Play of the tail relative to the wheel, in either direction.",
             ge=0.0,
             le=1.0,
         ),
@@ -180,8 +179,7 @@ class MotorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         float,
         unit(
             "kg m^2",
-            "Moment of inertia I of the tail about its hinge, with added mass of the water; its "
-            "torque on the wheel is λ I ω₀² (λφ − α) = λ I (α̈ + ξω₀α̇).",
+            "Moment of inertia I of the tail about its hinge, with added mass of the water.",
             ge=0.0,
             le=10.0,
         ),

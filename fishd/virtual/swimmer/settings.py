@@ -24,9 +24,8 @@ class Body(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         float,
         unit(
             "m",
-            "H: half of the body's thickness at X is H·s(X/L); t(X) in the paper's formula must be "
-            "half of the thickness, too. H also sets the curvature that the muscles command, "
-            "κ = ε₀ (X/L)ⁿ/H: change muscle.strain together with it.",
+            "H: half of the body's thickness at X is H·s(X/L). H also sets the curvature that the "
+            "muscles command, κ = ε₀ (X/L)ⁿ/H: change muscle.strain together with it.",
             gt=0.0,
             le=2.0,
         ),
@@ -126,8 +125,7 @@ class SwimmerSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "1",
-            "Gain of a torque without a net force that keeps the fish in the middle of the tank; "
-            "0: none, and the run ends when the fish reaches the coarse cells.",
+            "Gain of a torque that keeps the fish in the middle of the tank; 0: none.",
             ge=0.0,
             le=10.0,
         ),
@@ -139,8 +137,7 @@ class SwimmerSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "1",
-            "Seconds that a second of the fish takes in a live run, or more on a slow machine. "
-            "Runs in virtual time are as fast as possible.",
+            "Seconds that a second of the fish takes in a live run, or more on a slow machine.",
             ge=1.0,
             le=1000.0,
         ),

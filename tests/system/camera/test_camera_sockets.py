@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import shutil
 import socket
 import time
@@ -103,40 +102,6 @@ def test_a_flood_of_garbage_is_survived_with_frames(camera: CameraProcess, make:
         while newer < 30:
             new = client.poll_with_headers(5.0)
             newer += sum(header.seq > before for header, _ in new)
-
-
-def wait_for_view(client: CameraClient, after: float) -> None:
-    """Wait for a picture that is newer than this time of the camera's clock [s]."""
-
-    def has_come() -> bool:
-        client.poll(0.1)
-        return client.view is not None and client.view.header.time > after
-
-    wait_until(has_come)
-
-
-def test_subscriptions_to_unknown_topics_take_no_memory(camera: CameraProcess, make: Make) -> None:
-    with camera.client(views=True) as client:
-        wait_for_view(client, 0.0)
-        before = resident(camera)
-        stranger = make(zmq.XSUB)  # it sends any bytes in the place of subscriptions
-        stranger.set(zmq.SNDHWM, 0)
-        stranger.connect(camera.frames)
-        for _ in range(50_000):
-            stranger.send(b"\x01" + os.urandom(40))
-        end, most = time.monotonic() + 3.0, 0.0
-        while time.monotonic() < end:
-            most = max(most, resident(camera))
-            time.sleep(0.05)
-        assert client.view
-        wait_for_view(client, client.view.header.time + 3.0)
-    assert most < before + 60.0
-
-
-def resident(camera: CameraProcess) -> float:
-    """Return the memory of the process of a camera [MB]."""
-    statm = Path(f"/proc/{camera.process.pid}/statm").read_text()
-    return int(statm.split()[1]) * resource.getpagesize() / 2**20
 
 
 def test_within_a_tick_there_is_no_time_to_find_out_why_no_answer_comes(

@@ -116,9 +116,7 @@ CASES: list[tuple[str, str, str, dict[str, str | bytes], list[str]]] = [
     ("gpio pins", "ok", "", PINS, ["servo.gpio=17"]),
     ("gpio pins", "warning", "GPIO27", PINS, ["servo.gpio=17", "panel.led_gpio=27"]),
     ("gpio package", "", "", {}, []),
-    ("gpio package", "ok", "gpiod", {}, ["panel.estop_gpio=4"]),
     ("gpio package", "ok", "rpi-lgpio", PI_5, ["servo.driver=rpi-gpio"]),
-    ("gpio package", "ok", "gpiod, rpi-lgpio", {}, ["servo.driver=rpi-gpio", "panel.led_gpio=4"]),
     ("gpio chip", "", "", {}, []),
     ("amplifier", "ok", "", {}, ["force_sensor.full_scale=2.048"]),
     ("amplifier", "ok", "", {}, ["force_sensor.full_scale=4.096"]),
@@ -280,27 +278,25 @@ def test_pins_that_no_package_reaches_fail(
     assert "[rpi-lgpio]" in mend
     monkeypatch.setitem(sys.modules, "gpiod", None)
     assert examine("gpio package") == ("", "", "")
-    level, message, mend = examine("gpio package", "panel.estop_gpio=17")
+    level, message, mend = examine("gpio chip", "panel.estop_gpio=17")
     assert (level, "need the package gpiod, 2.3 or later" in message) == ("FAIL", True)
     assert mend.endswith("[pi]'")
 
 
-def test_a_panel_without_gpiod_uses_the_package_that_is_there(
+def test_the_older_library_is_refused_on_a_pi_5(
     root: Path, examine: Examine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "gpiod", None)
-    assert examine("gpio package", "panel.estop_gpio=17")[:2] == ("ok", "rpi-lgpio")
     monkeypatch.setattr("fishd.hardware.header._PROVIDERS", ("RPi.GPIO",))
     info = tmp_path / "RPi_GPIO-0.7.1.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: RPi.GPIO\nVersion: 0.7.1\n")
     monkeypatch.syspath_prepend(tmp_path)
-    assert examine("gpio package", "panel.estop_gpio=17")[:2] == ("ok", "RPi.GPIO")
+    assert examine("gpio package", "servo.driver=rpi-gpio")[:2] == ("ok", "RPi.GPIO")
     for path, content in PI_5.items():
         put(root, path, content)
-    level, message, mend = examine("gpio package", "panel.estop_gpio=17")
+    level, message, mend = examine("gpio package", "servo.driver=rpi-gpio")
     assert (level, message) == ("FAIL", "RPi.GPIO does not work on a Pi 5")
-    assert mend.endswith("[pi]'")
+    assert mend.endswith("[rpi-lgpio]'")
 
 
 def test_the_chip_of_the_pins_must_be_accessible_to_this_user(examine: Examine) -> None:

@@ -49,7 +49,7 @@ def test_fishd_on_a_virtual_pi_names_the_package(
     ("modules", "settings", "complaint"),
     [
         (MODULES, [], ONE_LINE % "adafruit-circuitpython-ads1x15"),
-        (["gpiod", "RPi"], ["panel.estop_gpio=9"], r"[^\n]*the pins of the header need[^\n]*\n"),
+        (["gpiod"], ["panel.estop_gpio=9"], r"[^\n]*need the package gpiod[^\n]*\n"),
     ],
 )
 def test_fishd_on_a_pi_does_not_start_without_what_it_needs(

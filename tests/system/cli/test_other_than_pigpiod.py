@@ -9,7 +9,7 @@ from rigs.processes import fishctl, running, sets, wait_until
 
 def test_fishd_doctor_and_release_say_that_it_is_not_pigpiod(pi: Bench) -> None:
     with other_server("ssh") as port:
-        problem = f"what answers at 127.0.0.1:{port} is not pigpiod: it sends 'SSH-2.0-OpenSSH"
+        problem = f"pigpiod at 127.0.0.1:{port}: it is not pigpiod: it answers command "
         settings = (*pi.settings, *sets(f"servo.port={port}"))
         ended = fishctl("release", *settings)
         assert (ended.returncode, ended.stdout) == (1, "")
@@ -17,9 +17,10 @@ def test_fishd_doctor_and_release_say_that_it_is_not_pigpiod(pi: Bench) -> None:
         shown = fishctl("doctor", *settings, "--endpoint", "ipc:///nowhere").stdout
         assert f"FAIL     pigpiod        {problem}" in shown
         assert "start pigpiod at another port (-p) and set servo.port" in shown
-        assert "restart pigpiod" not in shown
+        assert "'sudo ss -tlnp' names it" in shown
         with running(pi.folder, *settings) as fishd:
-            wait_until(lambda: problem in fishd.fishctl("status").stdout)
+            why = problem.partition(": ")[2]
+            wait_until(lambda: why in fishd.fishctl("status").stdout)
 
 
 def test_a_pigpiod_that_is_too_old_is_named_by_fishd_and_doctor(pi: Bench) -> None:

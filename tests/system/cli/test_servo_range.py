@@ -96,6 +96,6 @@ def test_each_remedy_for_pulses_that_end_too_early_works(remedy: str) -> None:
 
 
 def test_a_limit_that_is_off_by_rounding_cuts_nothing() -> None:
-    assert pulses.format_reach(ServoSettings(highest=0.42 - 1e-12), 0.42) == ""
+    assert pulses.format_reach(ServoSettings(highest=0.42 - 1e-12), 0.42) is None
     reach = pulses.format_reach(ServoSettings(highest=0.41), 0.42)
     assert reach == "-0.42 to +0.41 rad of ±0.42 rad"

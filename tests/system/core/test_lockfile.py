@@ -82,7 +82,7 @@ def test_what_was_planted_for_a_lock_is_refused(tmp_path: Path, what: str) -> No
     with pytest.raises(NotALock, match=what), locked(tmp_path / "control"):
         pass
     # And without a wait for the pipe's other end
-    assert find_lock_holder(tmp_path / "control") == ""
+    assert find_lock_holder(tmp_path / "control") is None
     assert victim.read_text() == "precious"
 
 

@@ -128,7 +128,7 @@ def test_hx711_a_wire_that_is_off_is_named_till_back(load_cells: Callable[..., L
         assert rig.sampler.trouble.startswith("no data from the HX711 on GPIO 13: check its power")
         rig.gpio.unplugged.clear()
         assert rig.run(2.0)
-        assert rig.sampler.trouble == ""
+        assert rig.sampler.trouble is None
         rig.gpio.shorted.add(6)
         rig.run(0.5)
         assert "is its DOUT shorted to ground?" in rig.sampler.trouble

@@ -1,4 +1,4 @@
-"""The E-stop button and the status light: the real gpiod and rpi-lgpio on emulated pins."""
+"""The E-stop button and the status light: the real gpiod on emulated pins."""
 
 import errno
 import sys
@@ -7,17 +7,15 @@ from collections.abc import Callable, Iterator
 from itertools import chain, repeat
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import pytest
 from gpiod import _ext
-from rigs import lgpio_module
 from rigs.processes import PATIENCE, wait_until
 
 from fishd.core.clock import VirtualClock
 from fishd.core.errors import StartupError
 from fishd.hardware.panel import Panel
-from fishd.hardware.panel_pins import find_chip
+from fishd.hardware.panel_pins import PanelPins, find_chip
 from fishd.hardware.settings import PanelSettings
 from fishd.virtual.pi import gpiochip
 from fishd.virtual.pi.i2c import kernel_error
@@ -32,7 +30,6 @@ TRUE = {name: getattr(_ext, name) for name in ("LineConfig", "LineSettings")}
 """Classes of gpiod's C module that the emulation replaces, and that need no chip."""
 
 Make = Callable[[PanelSettings], Panel]
-Pins = Any  # of either module: they have the same functions
 
 
 @pytest.fixture
@@ -41,21 +38,6 @@ def chip() -> Iterator[gpiochip.Pins]:
     chip = gpiochip.Pins()
     with gpiochip.EmulatedGpiod(chip):
         yield chip
-
-
-@pytest.fixture
-def without_gpiod(monkeypatch: pytest.MonkeyPatch) -> Iterator[lgpio_module.Pins]:
-    """Pins of a Pi on which rpi-lgpio is installed, and gpiod is not."""
-    monkeypatch.setitem(sys.modules, "gpiod", None)
-    pins = lgpio_module.Pins()
-    with lgpio_module.EmulatedLgpio(pins):
-        yield pins
-
-
-@pytest.fixture(params=["chip", "without_gpiod"])
-def pins(request: pytest.FixtureRequest) -> Pins:
-    """Pins through each library."""
-    return request.getfixturevalue(request.param)
 
 
 @pytest.fixture
@@ -73,30 +55,29 @@ def make() -> Iterator[Make]:
 
 
 @pytest.fixture
-def panel(pins: Pins, make: Make) -> Panel:
+def panel(chip: gpiochip.Pins, make: Make) -> Panel:
     """Panel whose button is released: its contact is closed."""
-    pins.set_level(BUTTON, GROUND)
+    chip.set_level(BUTTON, GROUND)
     return make(OPENS)
 
 
-def is_pulled_up(pins: Pins, pin: int) -> bool:
-    module = gpiochip if isinstance(pins, gpiochip.Pins) else lgpio_module
-    return bool(pins.lines[pin].pull == module.PULL_UP)
+def is_pulled_up(chip: gpiochip.Pins, pin: int) -> bool:
+    return chip.lines[pin].pull == gpiochip.PULL_UP
 
 
-def test_a_press_is_reported_at_once_by_another_thread(pins: Pins, panel: Panel) -> None:
+def test_a_press_is_reported_at_once_by_another_thread(chip: gpiochip.Pins, panel: Panel) -> None:
     threads = []
     panel.on_press = lambda: threads.append(threading.current_thread())
-    pins.set_level(BUTTON, OPEN)
+    chip.set_level(BUTTON, OPEN)
     wait_until(lambda: threads)
     assert threads != [threading.current_thread()]
 
 
-def test_a_press_is_reported_once_however_it_bounces(pins: Pins, panel: Panel) -> None:
+def test_a_press_is_reported_once_however_it_bounces(chip: gpiochip.Pins, panel: Panel) -> None:
     presses = []
     panel.on_press = lambda: presses.append(1)
     for level in (OPEN, GROUND, OPEN, GROUND, OPEN):
-        pins.set_level(BUTTON, level)
+        chip.set_level(BUTTON, level)
     wait_until(lambda: presses)
     for time in range(3):
         assert panel.update("estop", 0.05 * time) is True
@@ -104,33 +85,37 @@ def test_a_press_is_reported_once_however_it_bounces(pins: Pins, panel: Panel) -
     assert presses == [1]
 
 
-def test_a_press_between_two_ticks_is_seen(pins: Pins, panel: Panel) -> None:
+def test_a_press_between_two_ticks_is_seen(chip: gpiochip.Pins, panel: Panel) -> None:
     presses = []
     panel.on_press = lambda: presses.append(1)
     panel.update("running", 0.0)
-    pins.set_level(BUTTON, OPEN)
+    chip.set_level(BUTTON, OPEN)
     wait_until(lambda: presses)
-    pins.set_level(BUTTON, GROUND)
+    chip.set_level(BUTTON, GROUND)
     assert panel.update("running", 0.05) is True
     assert panel.update("running", 0.10) is False
 
 
-def test_a_release_takes_two_polls(without_gpiod: lgpio_module.Pins, make: Make) -> None:
-    pins, panel = without_gpiod, make(OPENS)  # here an edge is reported before the next line
+def test_a_release_takes_two_polls(
+    chip: gpiochip.Pins, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(PanelPins, "listen", lambda *_: None)  # polls alone see the button
+    monkeypatch.setattr(PanelPins, "close", lambda self: self._request.release())
+    panel = make(OPENS)
     assert panel.update("estop", 0.0) is True
-    pins.set_level(BUTTON, GROUND)
+    chip.set_level(BUTTON, GROUND)
     assert panel.update("estop", 0.05) is True
-    pins.set_level(BUTTON, OPEN)
+    chip.set_level(BUTTON, OPEN)
     assert panel.update("estop", 0.10) is True
-    pins.set_level(BUTTON, GROUND)
+    chip.set_level(BUTTON, GROUND)
     assert panel.update("estop", 0.15) is True
     assert panel.update("estop", 0.20) is False
 
 
 def test_a_button_that_is_pressed_at_the_start_is_seen_by_the_first_tick(
-    pins: Pins, make: Make
+    chip: gpiochip.Pins, make: Make
 ) -> None:
-    pins.set_level(BUTTON, OPEN)
+    chip.set_level(BUTTON, OPEN)
     assert make(OPENS).update("idle", 0.0) is True
 
 
@@ -146,18 +131,6 @@ def test_a_spike_that_is_gone_when_looked_at_is_no_press(
         spike(1)  # an edge, and the level is low again
         wait_until(lambda count=2 * number: len(calls) >= count)  # it read the edge and the level
     assert presses == []  # the second spike is read after the first was judged
-    assert panel.update("running", 0.0) is False
-
-
-def test_a_spike_that_is_gone_is_no_press_with_rpi_lgpio(
-    without_gpiod: lgpio_module.Pins, make: Make
-) -> None:
-    without_gpiod.set_level(BUTTON, GROUND)
-    panel, presses = make(OPENS), list[int]()
-    panel.on_press = lambda: presses.append(1)
-    (callback,) = without_gpiod.callbacks
-    callback.function(0, BUTTON, 1, 0)
-    assert presses == []
     assert panel.update("running", 0.0) is False
 
 
@@ -181,45 +154,35 @@ def test_a_contact_that_chatters_without_end_is_a_press(chip: gpiochip.Pins, mak
         thread.join()
 
 
-def test_a_broken_wire_is_a_press_where_the_button_opens_a_contact(pins: Pins, make: Make) -> None:
-    pins.set_level(BUTTON, GROUND)
+def test_a_broken_wire_is_a_press_where_the_button_opens_a_contact(
+    chip: gpiochip.Pins, make: Make
+) -> None:
+    chip.set_level(BUTTON, GROUND)
     panel = make(OPENS)
-    assert is_pulled_up(pins, BUTTON)
+    assert is_pulled_up(chip, BUTTON)
     assert panel.update("idle", 0.0) is False
-    pins.set_level(BUTTON, OPEN)
+    chip.set_level(BUTTON, OPEN)
     assert panel.update("idle", 0.05) is True
 
 
-def test_a_button_that_closes_a_contact_is_pressed_when_low(pins: Pins, make: Make) -> None:
+def test_a_button_that_closes_a_contact_is_pressed_when_low(
+    chip: gpiochip.Pins, make: Make
+) -> None:
     panel = make(CLOSES)
-    assert is_pulled_up(pins, BUTTON)
+    assert is_pulled_up(chip, BUTTON)
     assert panel.update("running", 0.0) is False
-    pins.set_level(BUTTON, GROUND)
+    chip.set_level(BUTTON, GROUND)
     assert panel.update("running", 0.05) is True
 
 
-def test_without_edges_polls_do(
-    without_gpiod: lgpio_module.Pins, make: Make, caplog: pytest.LogCaptureFixture
-) -> None:
-    pins = without_gpiod
-    pins.reports_edges = False
-    pins.set_level(BUTTON, GROUND)
-    panel = make(OPENS)
-    (message,) = caplog.messages
-    assert message.startswith("E-stop button on GPIO 17 is polled only, once a tick: bad event")
-    for tick in range(20):
-        assert panel.update("running", 0.05 * tick) is False
-    pins.set_level(BUTTON, OPEN)
-    assert panel.update("running", 1.0) is True
-    assert len(caplog.messages) == 1
-
-
-def record_light(pins: Pins, panel: Panel, mode: str, tick: float, seconds: float) -> list[int]:
+def record_light(
+    chip: gpiochip.Pins, panel: Panel, mode: str, tick: float, seconds: float
+) -> list[int]:
     """Return the level of the light after each tick."""
     levels = []
     for index in range(round(seconds / tick)):
         panel.update(mode, 100.0 + index * tick)
-        levels.append(pins.lines[LIGHT].level())
+        levels.append(chip.lines[LIGHT].level())
     return levels
 
 
@@ -229,8 +192,8 @@ def count_flashes(levels: list[int]) -> int:
 
 
 @pytest.mark.parametrize("tick", [0.01, 0.2])
-def test_the_light_flashes_each_second_idle(pins: Pins, panel: Panel, tick: float) -> None:
-    levels = record_light(pins, panel, "idle", tick, 10.0)
+def test_the_light_flashes_each_second_idle(chip: gpiochip.Pins, panel: Panel, tick: float) -> None:
+    levels = record_light(chip, panel, "idle", tick, 10.0)
     assert count_flashes(levels) == 10
     assert sum(levels) == pytest.approx(0.2 * len(levels), abs=0.05 * len(levels))
 
@@ -238,21 +201,21 @@ def test_the_light_flashes_each_second_idle(pins: Pins, panel: Panel, tick: floa
 @pytest.mark.parametrize("mode", ["fault", "estop"])
 @pytest.mark.parametrize(("tick", "rate"), [(0.05, 5.0), (0.2, 2.5)])
 def test_the_light_flickers_after_a_fault(
-    pins: Pins, panel: Panel, mode: str, tick: float, rate: float
+    chip: gpiochip.Pins, panel: Panel, mode: str, tick: float, rate: float
 ) -> None:
-    levels = record_light(pins, panel, mode, tick, 10.0)
+    levels = record_light(chip, panel, mode, tick, 10.0)
     assert count_flashes(levels) == pytest.approx(10.0 * rate, rel=0.15)
 
 
-def test_close_ends_the_light_and_the_reports(pins: Pins, panel: Panel) -> None:
+def test_close_ends_the_light_and_the_reports(chip: gpiochip.Pins, panel: Panel) -> None:
     presses = []
     panel.on_press = lambda: presses.append(1)
     panel.update("running", 0.0)
-    assert pins.lines[LIGHT].level() == 1
+    assert chip.lines[LIGHT].level() == 1
     panel.close()
     panel.close()
-    assert pins.lines[LIGHT].driven == 0
-    pins.set_level(BUTTON, OPEN)
+    assert chip.lines[LIGHT].driven == 0
+    chip.set_level(BUTTON, OPEN)
     assert presses == []
     assert "estop-button" not in [thread.name for thread in threading.enumerate()]
 
@@ -263,28 +226,6 @@ def test_closed_pins_are_free_for_other_programs(chip: gpiochip.Pins, make: Make
     panel.close()
     assert {chip.lines[pin].consumer for pin in (BUTTON, LIGHT)} == {None}
     make(OPENS)
-
-
-def test_close_gives_back_only_its_pins(without_gpiod: lgpio_module.Pins, make: Make) -> None:
-    pins, panel = without_gpiod, make(OPENS)
-    from RPi import GPIO
-
-    GPIO.setup(22, GPIO.OUT, initial=GPIO.HIGH)
-    panel.close()
-    assert not pins.lines[LIGHT].is_output
-    assert pins.lines[22].level() == 1
-
-
-def test_close_goes_on_when_a_step_fails(
-    without_gpiod: lgpio_module.Pins, make: Make, caplog: pytest.LogCaptureFixture
-) -> None:
-    pins, panel = without_gpiod, make(OPENS)
-    from RPi import GPIO
-
-    GPIO.cleanup(LIGHT)  # by another part of the program
-    panel.close()
-    assert caplog.messages[0].startswith("the status light on GPIO 27 cannot be switched any more")
-    assert pins.lines[BUTTON].pull == lgpio_module.PULL_NONE
 
 
 def test_a_chip_that_is_gone_is_one_error_of_the_button(
@@ -393,7 +334,6 @@ class TestPinsThatCannotBeUsed:
         """Debian 12 has one as python3-libgpiod."""
         monkeypatch.setitem(sys.modules, "gpiod", ModuleType("gpiod"))
         monkeypatch.setitem(sys.modules, "gpiod.line_settings", None)
-        monkeypatch.setattr("fishd.hardware.header._PROVIDERS", ())
         assert self.start() == (
             "E-stop button and status light need the package gpiod, 2.3 or later; install fishd[pi]"
         )

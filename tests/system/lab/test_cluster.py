@@ -172,7 +172,7 @@ def test_the_points_of_a_scheduler_that_dies_are_kept_and_the_rest_swim_here(
     tmp_path: Path,
 ) -> None:
     folder = tmp_path / "run"
-    words = ("sweep", "square", "--frequency", "0.4:4:0.01", *SHORT_SWIM, "--folder", str(folder))
+    words = ("sweep", "square", "--frequency", "0.4:4:0.004", *SHORT_SWIM, "--folder", str(folder))
     with dask_cluster(tmp_path) as dying:
         dying.add_worker()
         with subprocess.Popen(

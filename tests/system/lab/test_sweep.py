@@ -17,13 +17,13 @@ from fishd.core.errors import ConfigError, FishdError, RecordingError
 from fishd.core.signals import Tick
 from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.parallel import FileStop
-from fishd.lab.rerun import rerun
 from fishd.lab.session import Disturbed, VirtualSession
 from fishd.lab.sweep.curves import WholeTicks, find_best_of_whole_ticks, make_curves
 from fishd.lab.sweep.grid import MAX_POINTS, Lengths, Point
 from fishd.lab.sweep.measuring import Task, measure_all, simulate_point, swim
 from fishd.lab.sweep.results import Result, SweepFolder, select_quantity
 from fishd.recording import open_run
+from fishd.recording.rerun import rerun
 
 DRIFTS = ("simulation.noise=0.001", "simulation.drift=0.005", "simulation.offset_y=0.01")
 MEASURED = select_quantity("live", {}, "N").measured

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from gymnasium import wrappers
 from msgspec.structs import replace
 from rigs.harness import Rig, observe
+from rigs.policy_files import vector
 from rigs.swimming import NOISY, brief_job
 from stable_baselines3 import A2C, PPO, SAC
 from stable_baselines3.common.distributions import DiagGaussianDistribution
@@ -24,7 +25,6 @@ from fishd.cli.main import fishctl
 from fishd.config import load
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
-from fishd.controllers.policy.card import Layout
 from fishd.controllers.policy.file import read
 from fishd.controllers.policy.runtime import Network
 from fishd.core.errors import PolicyError
@@ -161,7 +161,7 @@ def test_a_model_of_the_user_becomes_a_policy_file(tmp_path: Path, kind: Any) ->
     assert env
     env.reset()
     seen = env.envs[0].unwrapped.latest
-    action, _ = model.predict(Layout(card.observation).vector(seen), deterministic=True)
+    action, _ = model.predict(vector(card.observation, seen), deterministic=True)
     assert controller.update(seen) == pytest.approx(0.3 * float(action[0]), abs=1e-5)
     past = card.provenance
     assert (past.algorithm, past.steps, past.seed) == (kind.__name__, 64, 4)
@@ -195,16 +195,6 @@ def test_wrappers_that_change_nothing_that_the_policy_sees_or_does_are_permitted
     assert monitor.total_steps == before, "its fish may be a real one"
 
 
-class Turned(gymnasium.RewardWrapper):
-    """Wrapper of rewards that changes actions, too."""
-
-    def reward(self, reward: Any) -> Any:
-        return reward
-
-    def step(self, action: Any) -> Any:
-        return super().step(-action)
-
-
 BOX = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
 INPUTS = gymnasium.spaces.Box(-np.inf, np.inf, (5,), np.float32)
 CHANGES: dict[str, Any] = {
@@ -217,7 +207,6 @@ CHANGES: dict[str, Any] = {
     "StickyAction": lambda env: wrappers.StickyAction(env, 0.5),
     "RescaleAction": lambda env: wrappers.RescaleAction(env, np.float32([-2.0]), np.float32([2.0])),
     "FrameStackObservation": lambda env: wrappers.FrameStackObservation(env, 3),
-    "Turned": Turned,
 }
 
 
@@ -324,17 +313,6 @@ class LoudFish(SwimEnv):
         return 10.0 * super()._agent_inputs()
 
 
-class Quiet(gymnasium.RewardWrapper):
-    """Wrapper of rewards, an instance of which mirrors the actions."""
-
-    def __init__(self, env: Any) -> None:
-        super().__init__(env)
-        self.step = lambda action: env.step(-action)  # type: ignore[method-assign]
-
-    def reward(self, reward: Any) -> Any:
-        return reward
-
-
 def fish(kind: type[SwimEnv] = SwimEnv, *overrides: str, **settings: Any) -> SwimEnv:
     config = load(None, overrides)
     return kind(SimulatedLink(config), config, EnvironmentSettings(**settings))
@@ -388,7 +366,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     ),
     "norm": (with_norm, "hidden layer of this model is LayerNorm, .* the same Tanh or ReLU"),
     "double": (in_double_precision, r"is in float64: call model\.policy\.float\(\)"),
-    "hook": (with_hook, "last layer of this model is Linear with its own hook, "),
+    "hook": (with_hook, "differ from those of the policy .* the model does more than its layers"),
     "recurrent": (
         lambda: PPO(RecurrentActorCriticPolicy, own_env(), device="cpu"),
         "policy of this model is RecurrentActorCriticPolicy, ",
@@ -408,7 +386,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     ),
     "overflow": (
         overflowing,
-        "this model computes no action: ValueError: .*nan.*; export an ear",
+        "output is not finite for the input .*; train it again, or export an earlier checkpoint",
     ),
     "other bounds": (
         lambda: changed("policy", "action_space", gymnasium.spaces.Box(-0.5, 0.5, (1,))),
@@ -430,33 +408,21 @@ REFUSED: dict[str, tuple[Any, str]] = {
         lambda: PPO("MlpPolicy", fish(LoudFish), device="cpu"),
         "the environment of this model is LoudFish, ",
     ),
-    "Quiet": (
-        lambda: PPO("MlpPolicy", Quiet(own_env()), device="cpu"),
-        "the wrapper of this model is Quiet with its own step, .* train one without that wrapper",
-    ),
-    "own predict": (
-        lambda: changed("", "predict", print),
-        "of this model is PPO with its own predict",
-    ),
     "own forward": (
         lambda: changed("policy.action_net", "forward", print),
-        "the last layer of this model is Linear with its own forward, ",
+        "this model computes no action: ",
     ),
     "another tick": (
         lambda: several(fish(), fish(SwimEnv, "tick=0.1")),
-        r"config\.tick of environment 1 of this model is 0\.1, not 0\.05 .* in equal environments",
+        r"environment 1 of this model has not the configuration with which .* equal environments",
     ),
     "another amplitude": (
         lambda: several(fish(), fish(), fish(SwimEnv, "amplitude_limit=0.3")),
-        r"config\.amplitude_limit of environment 2 of this model is 0\.3, not 0\.42 ",
+        r"environment 2 of this model has not the configuration with ",
     ),
     "other settings": (
         lambda: several(fish(), fish(episode=100)),
-        r"settings\.episode of environment 1 of this model is 100, not 768 ",
-    ),
-    "another fish": (
-        lambda: several(fish(), fish(SwimEnv, "plant.omega0=20")),
-        r"config\.plant\.omega0 of environment 1 of this model is 20\.0, not ",
+        r"environment 1 of this model has not the settings with ",
     ),
     "another class": (
         lambda: several(fish(), fish(MirroredFish)),
@@ -464,7 +430,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     ),
     "changed features": (
         lambda: several(features_changed()),
-        "features of environment 0 of this model is ",
+        "environment 0 of this model has not the features with ",
     ),
     "no last activation": (
         without_activation,
@@ -537,17 +503,6 @@ def test_the_file_of_an_unusual_model_has_the_outputs_of_its_policy(
         assert network.run() == pytest.approx(
             model.predict(row, deterministic=True)[0][0], abs=1e-5
         )
-
-
-def test_a_file_is_compared_with_the_angles_of_the_environment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    model = own_ppo()
-    step = SwimEnv.step
-    monkeypatch.setattr(SwimEnv, "step", lambda env, action: step(env, -action))
-    with pytest.raises(PolicyError, match="the outputs of the file differ from those of the polic"):
-        export_model(model, tmp_path / "a.onnx")
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,7 @@ from fishd.config import Config
 from fishd.controllers.policy import file
 from fishd.controllers.policy.file import PolicyFile
 from fishd.controllers.policy.network import to_onnx
-from fishd.controllers.policy.pilot import Pilot
-from fishd.controllers.policy.runtime import Network
+from fishd.controllers.policy.runtime import Network, Pilot
 from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import PolicyError
 from fishd.lab.compare import compare
@@ -59,10 +58,7 @@ CASES = [
 
 def network_of(settings: TrainingSettings) -> tuple[Network, Any]:
     card, policy, perception = randomly_excited(settings)
-    sight = exporting._make_sight(policy, perception)
-    content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
-    drawn = exporting._draw(policy, perception, card)
-    exporting._verify(PolicyFile(Path("eye.onnx"), content, card), policy, drawn)
+    content = exporting._build(Path("eye.onnx"), card, policy, perception)
     return Network(PolicyFile(Path("eye.onnx"), content, card)), perception
 
 

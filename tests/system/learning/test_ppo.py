@@ -7,9 +7,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from rigs.harness import observe
+from rigs.policy_files import vector
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from fishd.controllers.policy.card import Feature, Layout
+from fishd.controllers.policy.card import Feature
 from fishd.learning.env.environment import spaces
 from fishd.learning.env.perception import Perception
 from fishd.learning.ppo import DeterministicPolicy, Rollout, layers_of, learning_rate, make_policy
@@ -70,11 +71,10 @@ def test_the_policy_in_numpy_is_that_of_stable_baselines(
     with torch.no_grad():
         policy.action_net.weight *= 100.0  # so that some actions are clipped
     decide = DeterministicPolicy(policy, Perception(FEATURES), 0.42)
-    layout = Layout(FEATURES)
     angles = []
     for angle in np.linspace(-0.42, 0.42, 21):
         observation = observe(float(angle))
-        action, _ = policy.predict(layout.vector(observation), deterministic=True)
+        action, _ = policy.predict(vector(FEATURES, observation), deterministic=True)
         angles.append(decide(observation))
         assert angles[-1] == pytest.approx(0.42 * float(action[0]), abs=1e-5)
     assert len(set(angles)) > 2

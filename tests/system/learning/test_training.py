@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 from msgspec.structs import replace
+from rigs.policy_files import vector
 from rigs.processes import Subscriber, running, sets
 from rigs.swimming import BRIEF, NOISY, Failing, Losing, Resting, brief_job, rows
 from stable_baselines3.common.save_util import load_from_zip_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from fishd.controllers.policy.card import Layout
 from fishd.core.errors import ConfigError
 from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.env.environment import features, thrust_scale
@@ -355,14 +355,14 @@ def test_a_pause_is_never_part_of_a_transition(tmp_path: Path) -> None:
     link = Resting(job)
     training = Training(job, link, Display(), lambda: False)
     training.run()
-    layout = Layout(features(job.config, job.settings.environment))
+    inputs = features(job.config, job.settings.environment)
     environment = job.settings.environment
     per_newton = environment.reward_scale / thrust_scale(job.config, environment)
     buffer = training._model.rollout_buffer
     before, after = link.shown[-65:-1], link.shown[-64:]
     assert before[0].instruction_angle == 0.0
     assert after[0].time - before[0].time == pytest.approx(0.05)
-    seen = np.array([layout.vector(observation) for observation in before])
+    seen = np.array([vector(inputs, observation) for observation in before])
     np.testing.assert_array_equal(buffer.observations.reshape(64, -1), seen)
     rewards = np.array([per_newton * observation.fx for observation in after], np.float32)
     np.testing.assert_array_equal(buffer.rewards.flatten(), rewards)

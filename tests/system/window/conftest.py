@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from rigs.processes import Daemon, running
 from rigs.virtual_pi_process import Pi, virtual_pi
-from rigs.window_process import Browser, WindowProcess, open_page, run_apart, running_window
+from rigs.window_process import WindowProcess, run_apart, running_window, wait_until_live
 
 
 @pytest.fixture(scope="module")
@@ -17,12 +17,6 @@ def shared_window(
     with running_window(folder, fish=shared_daemon.endpoint) as window:
         run_apart(wait_until_live(window))
         yield window
-
-
-async def wait_until_live(window: WindowProcess) -> None:
-    """Wait until a window hears its fish."""
-    async with Browser(window.url) as browser, open_page(browser) as page:
-        await page.until("ticks")
 
 
 @pytest.fixture

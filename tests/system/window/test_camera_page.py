@@ -3,7 +3,7 @@
 import asyncio
 import socket
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -11,7 +11,6 @@ import aiohttp
 import msgspec
 import pytest
 from aiohttp import web
-from rigs.processes import PATIENCE
 
 from fishd.core.errors import StartupError
 from fishd.window import places, web_server
@@ -19,7 +18,6 @@ from fishd.window.camera_page.feed import News
 from fishd.window.camera_page.server import PageServer
 
 FACTS = b'{"state":"streaming"}'
-Test = Callable[[PageServer, aiohttp.ClientSession], Coroutine[Any, Any, None]]
 
 
 @asynccontextmanager
@@ -28,22 +26,14 @@ async def run_server() -> AsyncIterator[tuple[PageServer, aiohttp.ClientSession]
         yield server, session
 
 
-def run(test: Test) -> None:
-    async def run_all() -> None:
-        async with asyncio.timeout(PATIENCE), run_server() as (server, session):
-            await test(server, session)
-
-    asyncio.run(run_all())
-
-
 async def news_of(sock: aiohttp.ClientWebSocketResponse) -> tuple[Any, bytes]:
     message = await sock.receive_bytes()
     length = int.from_bytes(message[:4], "big")
     return msgspec.json.decode(message[4 : 4 + length]), message[4 + length :]
 
 
-def test_the_page_and_its_files_are_given_and_need_nothing_from_elsewhere() -> None:
-    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+async def test_the_page_and_its_files_are_given_and_need_nothing_from_elsewhere() -> None:
+    async with run_server() as (_, session):
         for path, kind in (("/", "text/html"), ("/page.js", "text/javascript"),
                            ("/page.css", "text/css")):  # fmt: skip
             async with session.get(path) as response:
@@ -51,22 +41,18 @@ def test_the_page_and_its_files_are_given_and_need_nothing_from_elsewhere() -> N
                 assert "default-src 'none'" in response.headers["Content-Security-Policy"]
                 assert "//" not in (await response.text()).replace("// ", "").replace("://$", "")
 
-    run(test)
 
-
-def test_a_page_gets_pictures_with_their_facts() -> None:
-    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+async def test_a_page_gets_pictures_with_their_facts() -> None:
+    async with run_server() as (server, session):
         server.show(News(FACTS, b"first"))
         async with session.ws_connect("/live") as sock:
             assert await news_of(sock) == ({"state": "streaming"}, b"first")
             server.show(News(b'{"state":"lost"}', None))
             assert await news_of(sock) == ({"state": "lost"}, b"")
 
-    run(test)
 
-
-def test_a_page_that_is_slow_gets_the_newest_picture_and_not_all_of_them() -> None:
-    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+async def test_a_page_that_is_slow_gets_the_newest_picture_and_not_all_of_them() -> None:
+    async with run_server() as (server, session):
         async with session.ws_connect("/live", max_msg_size=0) as sock:
             picture = bytes(2**20)
             for number in range(200):
@@ -79,27 +65,22 @@ def test_a_page_that_is_slow_gets_the_newest_picture_and_not_all_of_them() -> No
         assert len(seen) < 100
         assert seen == sorted(seen)
 
-    run(test)
-
 
 @pytest.mark.parametrize("method", ["POST", "DELETE"])
 @pytest.mark.parametrize("path", ["/", "/live"])
-def test_nothing_can_be_changed(method: str, path: str) -> None:
-    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
-        async with session.request(method, path, data=b"x") as response:
-            assert response.status == 405
-
-    run(test)
+async def test_nothing_can_be_changed(method: str, path: str) -> None:
+    async with (
+        run_server() as (_, session),
+        session.request(method, path, data=b"x") as response,
+    ):
+        assert response.status == 405
 
 
 @pytest.mark.parametrize("path", ["/none", "/%2e%2e/server.py"])
-def test_no_other_file_is_given(path: str) -> None:
-    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
-        async with session.get(path) as response:
-            assert response.status == 404
-            assert "nosniff" in response.headers["X-Content-Type-Options"]
-
-    run(test)
+async def test_no_other_file_is_given(path: str) -> None:
+    async with run_server() as (_, session), session.get(path) as response:
+        assert response.status == 404
+        assert "nosniff" in response.headers["X-Content-Type-Options"]
 
 
 @pytest.mark.parametrize(
@@ -108,52 +89,49 @@ def test_no_other_file_is_given(path: str) -> None:
      ("localhost.evil.example:9876", 403), ("[::1", 403), ("evil.example@localhost", 403),
      ("localhost:evil", 403)],
 )  # fmt: skip
-def test_who_asks_by_the_name_of_another_machine_is_refused(host: str, status: int) -> None:
-    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
-        async with session.get("/", headers={"Host": host}) as response:
-            assert response.status == status
-
-    run(test)
+async def test_who_asks_by_the_name_of_another_machine_is_refused(host: str, status: int) -> None:
+    async with (
+        run_server() as (_, session),
+        session.get("/", headers={"Host": host}) as response,
+    ):
+        assert response.status == status
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", ""])
-def test_a_page_from_elsewhere_does_not_get_the_picture(origin: str) -> None:
-    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+async def test_a_page_from_elsewhere_does_not_get_the_picture(origin: str) -> None:
+    async with run_server() as (server, session):
         server.show(News(FACTS, b"secret"))
         with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
             await session.ws_connect("/live", origin=origin)
         assert refused.value.status == 403
 
-    run(test)
-
 
 @pytest.mark.realtime
-def test_an_end_does_not_wait_for_pages_that_never_read_or_connections_that_never_ask() -> None:
-    async def run_all() -> float:
-        async with asyncio.timeout(20.0), PageServer("127.0.0.1", 0) as server:
-            host, port = "127.0.0.1", int(server.url.rsplit(":", 1)[1].strip("/"))
-            deaf = socket.socket()
-            deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            deaf.setblocking(False)
-            loop = asyncio.get_running_loop()
-            await loop.sock_connect(deaf, (host, port))
-            await loop.sock_sendall(deaf, UPGRADE.replace(b"HOST", f"{host}:{port}".encode()))
-            slow = [await asyncio.open_connection(host, port) for _ in range(4)]
-            for (_, writer), sent in zip(slow, HALF_ASKED, strict=True):
-                writer.write(sent)
-                await writer.drain()
-            assert (await loop.sock_recv(deaf, 12)).endswith(b" 101")
-            for _ in range(20):  # more than all buffers hold
-                server.show(News(FACTS, bytes(2**20)))
-                await asyncio.sleep(0.01)
-            ending = time.monotonic()
-        ended = time.monotonic() - ending
-        deaf.close()
-        for _, writer in slow:
-            writer.close()
-        return ended
-
-    assert asyncio.run(run_all()) < 1.5
+async def test_an_end_does_not_wait_for_pages_that_never_read_or_connections_that_never_ask() -> (
+    None
+):
+    async with asyncio.timeout(20.0), PageServer("127.0.0.1", 0) as server:
+        host, port = "127.0.0.1", int(server.url.rsplit(":", 1)[1].strip("/"))
+        deaf = socket.socket()
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        deaf.setblocking(False)
+        loop = asyncio.get_running_loop()
+        await loop.sock_connect(deaf, (host, port))
+        await loop.sock_sendall(deaf, UPGRADE.replace(b"HOST", f"{host}:{port}".encode()))
+        slow = [await asyncio.open_connection(host, port) for _ in range(4)]
+        for (_, writer), sent in zip(slow, HALF_ASKED, strict=True):
+            writer.write(sent)
+            await writer.drain()
+        assert (await loop.sock_recv(deaf, 12)).endswith(b" 101")
+        for _ in range(20):  # more than all buffers hold
+            server.show(News(FACTS, bytes(2**20)))
+            await asyncio.sleep(0.01)
+        ending = time.monotonic()
+    ended = time.monotonic() - ending
+    deaf.close()
+    for _, writer in slow:
+        writer.close()
+    assert ended < 1.5
 
 
 UPGRADE = (
@@ -176,29 +154,26 @@ async def neighbour(server: PageServer) -> AsyncIterator[aiohttp.ClientSession]:
         yield session
 
 
-def test_more_pages_than_are_served_are_refused_and_let_in_once_another_is_gone() -> None:
-    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
-        async with neighbour(server) as second_session:
-            most = web_server.MAX_VIEWERS_PER_ADDRESS
-            socks = [await session.ws_connect("/live") for _ in range(most)]
-            await check_refused(session)
-            while len(socks) < web_server.MAX_VIEWERS:
-                socks.append(await second_session.ws_connect("/live"))
-            await check_refused(second_session)
-            await socks[0].close()
-            while True:
-                try:
-                    sock = await session.ws_connect("/live")
-                    break
-                except aiohttp.WSServerHandshakeError:
-                    await asyncio.sleep(0.02)
-            server.show(News(FACTS, b"again"))
-            while (await news_of(sock))[1] != b"again":
-                pass
-            for opened in (*socks, sock):
-                await opened.close()
-
-    run(test)
+async def test_more_pages_than_are_served_are_refused_and_let_in_once_another_is_gone() -> None:
+    async with run_server() as (server, session), neighbour(server) as second_session:
+        most = web_server.MAX_VIEWERS_PER_ADDRESS
+        socks = [await session.ws_connect("/live") for _ in range(most)]
+        await check_refused(session)
+        while len(socks) < web_server.MAX_VIEWERS:
+            socks.append(await second_session.ws_connect("/live"))
+        await check_refused(second_session)
+        await socks[0].close()
+        while True:
+            try:
+                sock = await session.ws_connect("/live")
+                break
+            except aiohttp.WSServerHandshakeError:
+                await asyncio.sleep(0.02)
+        server.show(News(FACTS, b"again"))
+        while (await news_of(sock))[1] != b"again":
+            pass
+        for opened in (*socks, sock):
+            await opened.close()
 
 
 async def check_refused(session: aiohttp.ClientSession) -> None:
@@ -220,10 +195,12 @@ COMPLETE_REQUEST = b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: keep-alive
 
 
 @pytest.mark.parametrize("sent", [HALF_ASKED[0], HALF_ASKED[3], COMPLETE_REQUEST])
-def test_no_client_keeps_the_page_from_others(sent: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_no_client_keeps_the_page_from_others(
+    sent: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(web_server, "REQUEST_TIMEOUT_S", 120.0)
 
-    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+    async with run_server() as (server, session):
         clients = [await connect(server, sent) for _ in range(100)]
         ends = [asyncio.create_task(reader.read()) for reader, _ in clients]
         try:
@@ -238,10 +215,10 @@ def test_no_client_keeps_the_page_from_others(sent: bytes, monkeypatch: pytest.M
                 writer.close()
             await asyncio.gather(*ends, return_exceptions=True)
 
-    run(test)
 
-
-def test_a_connection_that_sends_nothing_costs_no_handler(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_connection_that_sends_nothing_costs_no_handler(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     create, created = web.Server.__call__, 0
 
     def count(server: web.Server) -> web.RequestHandler:
@@ -251,7 +228,7 @@ def test_a_connection_that_sends_nothing_costs_no_handler(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(web.Server, "__call__", count)
 
-    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+    async with run_server() as (server, session):
         silent = [await connect(server) for _ in range(50)]
         async with session.get("/") as response:  # is accepted after them
             assert response.status == 200
@@ -259,26 +236,20 @@ def test_a_connection_that_sends_nothing_costs_no_handler(monkeypatch: pytest.Mo
         for _, writer in silent:
             writer.close()
 
-    run(test)
-
 
 @pytest.mark.parametrize("sent", HALF_ASKED)
-def test_half_a_request_is_ended_soon(sent: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_half_a_request_is_ended_soon(sent: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(web_server, "REQUEST_TIMEOUT_S", 0.3)
 
-    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+    async with run_server() as (server, _):
         reader, writer = await connect(server, sent)
         await reader.read()
         writer.close()
 
-    run(test)
 
-
-def test_a_port_that_is_taken_is_one_line() -> None:
-    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+async def test_a_port_that_is_taken_is_one_line() -> None:
+    async with run_server() as (server, _):
         port = int(server.url.rsplit(":", 1)[1].strip("/"))
         with pytest.raises(StartupError, match=r"cannot serve a page at .*; name another port"):
             async with PageServer("127.0.0.1", port):
                 pass
-
-    run(test)

@@ -1,10 +1,9 @@
 """Devices of the network: pairing, scopes, and revocation that closes their pages."""
 
-import asyncio
 import json
 import re
-import signal
 import stat
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -18,29 +17,11 @@ from rigs.window_process import (
     Browser,
     WindowProcess,
     open_page,
-    run,
     running_window,
 )
 
 from fishd.window import devices
 from fishd.window.devices import DeviceError, Devices
-
-SLOW_DISK = """
-import signal, threading
-from fishd.window import devices, paired_devices
-paired_devices.CHANGE_TIMEOUT_S = 0.1
-real, goes_on = devices.secrets.token_hex, threading.Event()
-def token_hex(size):
-    if threading.current_thread().name.startswith("devices"):
-        goes_on.wait()
-    return real(size)
-devices.secrets.token_hex = token_hex
-def go_on(*_):
-    paired_devices.CHANGE_TIMEOUT_S = 60.0
-    goes_on.set()
-signal.signal(signal.SIGUSR1, go_on)
-"""
-"""Code of a window whose disk lets a pairing wait until SIGUSR1."""
 
 
 def token_of(link: str) -> str:
@@ -66,99 +47,79 @@ async def refuse_page(browser: Browser) -> int:
     return refusal.value.status
 
 
-def test_a_device_that_is_not_paired_gets_only_the_page(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with Browser(window.url, NETWORK_HOST) as browser:
-            session = await browser.get("/api/session")
-            assert (session["paired"], session["scope"], session["device"]) == (False, None, None)
-            for path in ("/api/fish", "/api/jobs", "/api/runs"):
-                assert await browser.refusal(path) == (401, "not-paired")
-            for path in ("estop", "drive", "release", "request"):
-                assert await browser.refusal(f"/api/fish/fish/{path}", {}) == (401, "not-paired")
-            assert await browser.refusal("/api/jobs", {}) == (401, "not-paired")
-            assert await refuse_page(browser) == 401
-
-    run(test())
+async def test_a_device_that_is_not_paired_gets_only_the_page(window: WindowProcess) -> None:
+    async with Browser(window.url, NETWORK_HOST) as browser:
+        session = await browser.get("/api/session")
+        assert (session["paired"], session["scope"], session["device"]) == (False, None, None)
+        for path in ("/api/fish", "/api/jobs", "/api/runs"):
+            assert await browser.refusal(path) == (401, "not-paired")
+        for path in ("estop", "drive", "release", "request"):
+            assert await browser.refusal(f"/api/fish/fish/{path}", {}) == (401, "not-paired")
+        assert await browser.refusal("/api/jobs", {}) == (401, "not-paired")
+        assert await refuse_page(browser) == 401
 
 
-def test_a_token_pairs_one_device_and_no_second_one(window: WindowProcess) -> None:
-    async def test() -> None:
-        token = token_of(window.invite("watch"))
-        async with (
-            Browser(window.url, NETWORK_HOST) as first,
-            Browser(window.url, NETWORK_HOST) as second,
-        ):
-            async with first.session.post(
-                "/api/pair", json={"token": token, "name": "A"}
-            ) as answer:
-                cookie = answer.headers["Set-Cookie"]
-                assert answer.status == 200
-            for part in ("HttpOnly", "SameSite=Strict", "Max-Age=31536000", "Path=/"):
-                assert part in cookie
-            assert (await first.get("/api/session"))["scope"] == "watch"
-            assert await second.refusal("/api/pair", {"token": token}) == (403, "device")
-            assert await second.refusal("/api/pair", {"token": "x" * 22}) == (403, "device")
-            await first.post("/api/unpair")
-            assert not (await first.get("/api/session"))["paired"]
-
-    run(test())
+async def test_a_token_pairs_one_device_and_no_second_one(window: WindowProcess) -> None:
+    token = token_of(window.invite("watch"))
+    async with (
+        Browser(window.url, NETWORK_HOST) as first,
+        Browser(window.url, NETWORK_HOST) as second,
+    ):
+        async with first.session.post("/api/pair", json={"token": token, "name": "A"}) as answer:
+            cookie = answer.headers["Set-Cookie"]
+            assert answer.status == 200
+        for part in ("HttpOnly", "SameSite=Strict", "Max-Age=31536000", "Path=/"):
+            assert part in cookie
+        assert (await first.get("/api/session"))["scope"] == "watch"
+        assert await second.refusal("/api/pair", {"token": token}) == (403, "device")
+        assert await second.refusal("/api/pair", {"token": "x" * 22}) == (403, "device")
+        await first.post("/api/unpair")
+        assert not (await first.get("/api/session"))["paired"]
 
 
-def test_a_device_that_may_watch_sees_the_fish_stops_it_and_nothing_more(
+async def test_a_device_that_may_watch_sees_the_fish_stops_it_and_nothing_more(
     window: WindowProcess,
 ) -> None:
-    async def test() -> None:
-        async with paired(window, "watch", "wall") as browser, open_page(browser) as page:
-            assert page.hello["session"]["scope"] == "watch"
-            await page.until("ticks")
-            for what in ("drive", "release", "request"):
-                assert await page.refusal(what) == (403, "only-watch")
-            assert await page.refusal("/api/jobs") == (403, "only-watch")
-            assert (await page.post("estop"))["way"] == "control"
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            await page.drive()
-            await page.request("clear-fault")
-
-    run(test())
+    async with paired(window, "watch", "wall") as browser, open_page(browser) as page:
+        assert page.hello["session"]["scope"] == "watch"
+        await page.until("ticks")
+        for what in ("drive", "release", "request"):
+            assert await page.refusal(what) == (403, "only-watch")
+        assert await page.refusal("/api/jobs") == (403, "only-watch")
+        assert (await page.post("estop"))["way"] == "control"
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        await page.drive()
+        await page.request("clear-fault")
 
 
-def test_a_paired_device_drives(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with paired(window, "drive", "tablet") as browser, open_page(browser) as page:
+async def test_a_paired_device_drives(window: WindowProcess) -> None:
+    async with paired(window, "drive", "tablet") as browser, open_page(browser) as page:
+        await page.swim()
+        status = await page.until("status", lambda status: status["lease"])
+        assert status["lease"]["name"] == "window: tablet"
+        await page.request("stop")
+
+
+async def test_a_revoked_device_loses_its_page_and_the_fish_stops(window: WindowProcess) -> None:
+    async with Browser(window.url) as here, open_page(here) as watcher:
+        async with paired(window, "drive", "stolen") as browser, open_page(browser) as page:
             await page.swim()
-            status = await page.until("status", lambda status: status["lease"])
-            assert status["lease"]["name"] == "window: tablet"
-            await page.request("stop")
-
-    run(test())
-
-
-def test_a_revoked_device_loses_its_page_and_the_fish_stops(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as here, open_page(here) as watcher:
-            async with paired(window, "drive", "stolen") as browser, open_page(browser) as page:
-                await page.swim()
-                removed = window.ask("revoke", "stolen")
-                assert removed == "stolen is no longer paired; what it drives and its jobs end\n"
-                while (await page.sock.receive()).type is aiohttp.WSMsgType.TEXT:
-                    pass
-                assert page.sock.closed
-                assert await refuse_page(browser) == 401
-                assert await browser.refusal("/api/fish/fish/estop", {}) == (401, "not-paired")
-            await watcher.until_at_rest()
-
-    run(test())
+            removed = window.ask("revoke", "stolen")
+            assert removed == "stolen is no longer paired; what it drives and its jobs end\n"
+            while (await page.sock.receive()).type is aiohttp.WSMsgType.TEXT:
+                pass
+            assert page.sock.closed
+            assert await refuse_page(browser) == 401
+            assert await browser.refusal("/api/fish/fish/estop", {}) == (401, "not-paired")
+        await watcher.until_at_rest()
 
 
-def test_the_devices_are_listed_without_any_secret(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with paired(window, "watch", "listed"):
-            text = window.ask("devices")
-            assert re.search(r"(?m)^\w{8}  watch  seen \d{4}-\d\d-\d\d \d\d h  listed$", text)
-            listed: list[dict[str, Any]] = json.loads(window.ask("devices", "--json"))
-            assert listed[-1].keys() == {"id", "name", "scope", "paired", "seen"}
-
-    run(test())
+async def test_the_devices_are_listed_without_any_secret(window: WindowProcess) -> None:
+    async with paired(window, "watch", "listed"):
+        text = window.ask("devices")
+        assert re.search(r"(?m)^\w{8}  watch  seen \d{4}-\d\d-\d\d \d\d h  listed$", text)
+        listed: list[dict[str, Any]] = json.loads(window.ask("devices", "--json"))
+        assert listed[-1].keys() == {"id", "name", "scope", "paired", "seen"}
     file = window.state / "devices.json"
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert stat.S_IMODE(window.state.stat().st_mode) == 0o700
@@ -182,6 +143,29 @@ def test_a_token_expires(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     paired.pair(paired.invite("watch"), "first")
     with pytest.raises(DeviceError, match="1 devices are paired"):
         paired.pair(paired.invite("watch"), "second")
+
+
+@pytest.mark.parametrize("seconds", [-86400.0, 86400.0])
+def test_a_step_of_the_clock_neither_ends_nor_revives_a_link(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: float
+) -> None:
+    paired, real = Devices(tmp_path), time.time
+    valid, expired = paired.invite("watch"), paired.invite("watch", seconds=0.0)
+    monkeypatch.setattr(time, "time", lambda: real() + seconds)
+    with pytest.raises(DeviceError, match="was used already, or has expired"):
+        Devices(tmp_path).pair(expired, "late")
+    assert Devices(tmp_path).pair(valid, "in time")[0].scope == "watch"
+
+
+def test_a_link_from_before_the_machine_was_started_again_has_expired(tmp_path: Path) -> None:
+    paired = Devices(tmp_path)
+    token = paired.invite("watch")
+    file = tmp_path / "devices.json"
+    content = json.loads(file.read_text())
+    content["invitations"][0]["boot"] = "an earlier one"
+    file.write_text(json.dumps(content))
+    with pytest.raises(DeviceError, match="was used already, or has expired"):
+        paired.pair(token, "late")
 
 
 def test_a_state_folder_that_others_may_write_is_refused_as_they_could_pair_devices(
@@ -217,31 +201,6 @@ def test_a_damaged_file_pairs_nothing_and_says_what_to_do(tmp_path: Path) -> Non
     assert [device.name for device in paired.all()] == ["tablet"]
 
 
-def test_a_pairing_that_came_too_late_pairs_nothing_and_keeps_the_link(
-    daemon: Daemon, tmp_path: Path
-) -> None:
-    with running_window(tmp_path, changes=SLOW_DISK, fish=daemon.endpoint) as window:
-
-        async def test() -> None:
-            token = token_of(window.invite())
-            async with Browser(window.url, NETWORK_HOST) as browser:
-                body = {"token": token, "name": "tablet"}
-                assert await browser.refusal("/api/pair", body) == (503, "busy")
-                window.process.send_signal(signal.SIGUSR1)
-                while await _is_busy(browser, body):
-                    await asyncio.sleep(0.05)
-            assert [device.name for device in Devices(window.state).all()] == ["tablet"]
-
-        run(test())
-
-
-async def _is_busy(browser: Browser, body: dict[str, str]) -> bool:
-    """Try to pair a browser; return whether the disk was too slow for it."""
-    async with browser.session.post("/api/pair", json=body) as response:
-        assert response.status in (200, 503)
-        return response.status == 503
-
-
 def test_the_copy_of_the_file_revives_no_revoked_device(tmp_path: Path) -> None:
     paired = Devices(tmp_path)
     for name in ("stolen", "tablet"):
@@ -265,32 +224,23 @@ def test_the_file_is_written_after_its_copy(tmp_path: Path) -> None:
     assert paired.read_copy() == ()
 
 
-def test_a_revoked_device_loses_its_foxglove_too(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with paired(window, "watch", "viewer") as browser:
-            options = {"protocols": ["foxglove.sdk.v1"]}
-            async with browser.session.ws_connect("/foxglove", **options) as sock:
-                await sock.receive_str()
-                window.ask("revoke", "viewer")
-                while not sock.closed:
-                    await sock.receive()
-
-    run(test())
+async def test_a_revoked_device_loses_its_foxglove_too(window: WindowProcess) -> None:
+    async with paired(window, "watch", "viewer") as browser:
+        options = {"protocols": ["foxglove.sdk.v1"]}
+        async with browser.session.ws_connect("/foxglove", **options) as sock:
+            await sock.receive_str()
+            window.ask("revoke", "viewer")
+            while not sock.closed:
+                await sock.receive()
 
 
-def test_with_pair_all_a_browser_on_this_machine_needs_pairing(
+async def test_with_pair_all_a_browser_on_this_machine_needs_pairing(
     daemon: Daemon, tmp_path: Path
 ) -> None:
     with running_window(tmp_path, settings="pair_all: true", fish=daemon.endpoint) as window:
-
-        async def test() -> None:
-            async with Browser(window.url) as browser:
-                assert await browser.refusal("/api/fish") == (401, "not-paired")
-                assert await browser.refusal("/api/fish/fish/estop", {}) == (401, "not-paired")
-                session = await browser.post(
-                    "/api/pair", {"token": token_of(window.invite("drive"))}
-                )
-                assert (session["scope"], session["loopback"]) == ("drive", False)
-                assert await browser.get("/api/fish")
-
-        run(test())
+        async with Browser(window.url) as browser:
+            assert await browser.refusal("/api/fish") == (401, "not-paired")
+            assert await browser.refusal("/api/fish/fish/estop", {}) == (401, "not-paired")
+            session = await browser.post("/api/pair", {"token": token_of(window.invite("drive"))})
+            assert (session["scope"], session["loopback"]) == ("drive", False)
+            assert await browser.get("/api/fish")

@@ -11,7 +11,7 @@ import aiohttp
 import pytest
 from rigs.documents import FENCE, ROOT
 from rigs.processes import Daemon, Process
-from rigs.window_process import NETWORK_HOST, Browser, WindowProcess, run, running_window
+from rigs.window_process import NETWORK_HOST, Browser, WindowProcess, running_window
 
 from fishd.core.schema import fields_of
 from fishd.window.foxglove import CHANNELS, PROTOCOL
@@ -25,32 +25,29 @@ async def read_text(sock: aiohttp.ClientWebSocketResponse) -> dict[str, Any]:
     return message
 
 
-def test_a_viewer_gets_the_ticks_to_which_it_subscribes(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with (
-            Browser(window.url) as browser,
-            browser.session.ws_connect("/foxglove", protocols=[PROTOCOL]) as sock,
-        ):
-            assert sock.protocol == PROTOCOL
-            info = await read_text(sock)
-            assert (info["op"], info["capabilities"]) == ("serverInfo", [])
-            channels = {c["topic"]: c for c in (await read_text(sock))["channels"]}
-            assert set(channels) == set(CHANNELS)
-            tick = channels["tick"]
-            assert json.loads(tick["schema"])["properties"]["fx"]["type"] == "number"
-            request = {"op": "subscribe", "subscriptions": [{"id": 7, "channelId": tick["id"]}]}
-            await sock.send_str(json.dumps(request))
-            seqs = []
-            for _ in range(3):
-                data = await sock.receive_bytes()
-                opcode, number, nanoseconds = struct.unpack("<BIQ", data[:13])
-                message = json.loads(data[13:])
-                assert (opcode, number) == (1, 7)
-                assert abs(nanoseconds * 1e-9 - message["t"]) < 0.1
-                seqs.append(message["seq"])
-            assert seqs == [seqs[0], seqs[0] + 1, seqs[0] + 2]
-
-    run(test())
+async def test_a_viewer_gets_the_ticks_to_which_it_subscribes(window: WindowProcess) -> None:
+    async with (
+        Browser(window.url) as browser,
+        browser.session.ws_connect("/foxglove", protocols=[PROTOCOL]) as sock,
+    ):
+        assert sock.protocol == PROTOCOL
+        info = await read_text(sock)
+        assert (info["op"], info["capabilities"]) == ("serverInfo", [])
+        channels = {c["topic"]: c for c in (await read_text(sock))["channels"]}
+        assert set(channels) == set(CHANNELS)
+        tick = channels["tick"]
+        assert json.loads(tick["schema"])["properties"]["fx"]["type"] == "number"
+        request = {"op": "subscribe", "subscriptions": [{"id": 7, "channelId": tick["id"]}]}
+        await sock.send_str(json.dumps(request))
+        seqs = []
+        for _ in range(3):
+            data = await sock.receive_bytes()
+            opcode, number, nanoseconds = struct.unpack("<BIQ", data[:13])
+            message = json.loads(data[13:])
+            assert (opcode, number) == (1, 7)
+            assert abs(nanoseconds * 1e-9 - message["t"]) < 0.1
+            seqs.append(message["seq"])
+        assert seqs == [seqs[0], seqs[0] + 1, seqs[0] + 2]
 
 
 @pytest.mark.parametrize(
@@ -62,17 +59,14 @@ def test_a_viewer_gets_the_ticks_to_which_it_subscribes(window: WindowProcess) -
         "[" * 500,
     ],
 )
-def test_a_viewer_can_only_read(window: WindowProcess, message: str) -> None:
-    async def test() -> None:
-        async with (
-            Browser(window.url) as browser,
-            browser.session.ws_connect("/foxglove", protocols=[PROTOCOL]) as sock,
-        ):
-            await read_text(sock), await read_text(sock)
-            await sock.send_str(message)
-            assert (await read_text(sock))["level"] == 1
-
-    run(test())
+async def test_a_viewer_can_only_read(window: WindowProcess, message: str) -> None:
+    async with (
+        Browser(window.url) as browser,
+        browser.session.ws_connect("/foxglove", protocols=[PROTOCOL]) as sock,
+    ):
+        await read_text(sock), await read_text(sock)
+        await sock.send_str(message)
+        assert (await read_text(sock))["level"] == 1
 
 
 def test_the_program_of_the_page_pairs_and_prints_forces(window: WindowProcess) -> None:
@@ -84,7 +78,7 @@ def test_the_program_of_the_page_pairs_and_prints_forces(window: WindowProcess) 
         assert abs(float(program.process.stdout.readline())) < 1.0
 
 
-def test_only_origins_of_the_settings_and_paired_devices_read(
+async def test_only_origins_of_the_settings_and_paired_devices_read(
     daemon: Daemon, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder = tmp_path_factory.mktemp("origins")
@@ -100,29 +94,23 @@ def test_only_origins_of_the_settings_and_paired_devices_read(
                 except aiohttp.WSServerHandshakeError as refusal:
                     return refusal.status
 
-        async def test() -> None:
-            assert await connect("/foxglove", Origin=LICHTBLICK) == 101
-            assert await connect("/live", Origin=LICHTBLICK) == 403
-            assert await connect("/foxglove", Origin="http://evil.example") == 403
-            assert await connect("/foxglove", "fish.example") == 401
-
-        run(test())
+        assert await connect("/foxglove", Origin=LICHTBLICK) == 101
+        assert await connect("/live", Origin=LICHTBLICK) == 403
+        assert await connect("/foxglove", Origin="http://evil.example") == 403
+        assert await connect("/foxglove", "fish.example") == 401
 
 
-def test_a_program_of_another_machine_reads_once_it_is_paired_until_it_is_revoked(
+async def test_a_program_of_another_machine_reads_once_it_is_paired_until_it_is_revoked(
     window: WindowProcess,
 ) -> None:
-    async def test() -> None:
-        async with Browser(window.url, NETWORK_HOST) as browser:
-            token = window.invite("watch").partition("#pair=")[2]
-            await browser.post("/api/pair", {"token": token, "name": "viewer"})
-            async with browser.session.ws_connect("/foxglove", protocols=[PROTOCOL]) as sock:
-                assert (await read_text(sock))["op"] == "serverInfo"
-                window.ask("revoke", "viewer")
-                while not sock.closed:
-                    await sock.receive()
-
-    run(test())
+    async with Browser(window.url, NETWORK_HOST) as browser:
+        token = window.invite("watch").partition("#pair=")[2]
+        await browser.post("/api/pair", {"token": token, "name": "viewer"})
+        async with browser.session.ws_connect("/foxglove", protocols=[PROTOCOL]) as sock:
+            assert (await read_text(sock))["op"] == "serverInfo"
+            window.ask("revoke", "viewer")
+            while not sock.closed:
+                await sock.receive()
 
 
 def leaves(layout: Any) -> Iterator[str]:

@@ -6,7 +6,7 @@ from typing import Any
 import aiohttp
 import pytest
 from rigs.processes import Daemon
-from rigs.window_process import Browser, WindowProcess, open_page, run
+from rigs.window_process import Browser, WindowProcess, open_page
 
 from fishd.window.access import is_loopback
 
@@ -36,75 +36,63 @@ CHANGES = [
 
 
 @pytest.mark.parametrize("host", REBOUND)
-def test_no_name_that_leads_here_but_is_not_ours_gets_anything(
+async def test_no_name_that_leads_here_but_is_not_ours_gets_anything(
     window: WindowProcess, daemon: Daemon, host: str
 ) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            await page.drive()
-            authority = f"{host}:{window.port}" if host else ""
-            headers = {
-                "Host": authority, "Origin": f"http://{authority}",
-                "X-Client": page.hello["client"],
-            }  # fmt: skip
-            for path in ("/", "/api/session", "/api/fish"):
-                async with browser.session.get(path, headers=headers) as response:
-                    assert response.status == 403
-            for path, body in CHANGES:
-                assert await browser.refusal(path, body, headers=headers) == (403, "forbidden")
-            with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
-                await browser.session.ws_connect("/live", headers=headers)
-            assert refusal.value.status == 403
-
-    run(test())
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        await page.drive()
+        authority = f"{host}:{window.port}" if host else ""
+        headers = {
+            "Host": authority, "Origin": f"http://{authority}",
+            "X-Client": page.hello["client"],
+        }  # fmt: skip
+        for path in ("/", "/api/session", "/api/fish"):
+            async with browser.session.get(path, headers=headers) as response:
+                assert response.status == 403
+        for path, body in CHANGES:
+            assert await browser.refusal(path, body, headers=headers) == (403, "forbidden")
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
+            await browser.session.ws_connect("/live", headers=headers)
+        assert refusal.value.status == 403
     assert daemon.status().mode == "idle"
 
 
 @pytest.mark.parametrize("origin", FOREIGN)
-def test_no_page_of_another_origin_changes_or_sees_anything(
+async def test_no_page_of_another_origin_changes_or_sees_anything(
     window: WindowProcess, daemon: Daemon, origin: str
 ) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            await page.drive()
-            foreign = origin.format(port=window.port)
-            headers = {"Origin": foreign, "X-Client": page.hello["client"]}
-            for path, body in CHANGES:
-                assert await browser.refusal(path, body, headers=headers) == (403, "forbidden")
-            with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
-                await browser.session.ws_connect("/live", headers=headers)
-            assert refusal.value.status == 403
-
-    run(test())
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        await page.drive()
+        foreign = origin.format(port=window.port)
+        headers = {"Origin": foreign, "X-Client": page.hello["client"]}
+        for path, body in CHANGES:
+            assert await browser.refusal(path, body, headers=headers) == (403, "forbidden")
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
+            await browser.session.ws_connect("/live", headers=headers)
+        assert refusal.value.status == 403
     assert daemon.status().mode == "idle"
 
 
-def test_a_change_without_an_origin_and_a_form_are_refused(
+async def test_a_change_without_an_origin_and_a_form_are_refused(
     window: WindowProcess, daemon: Daemon
 ) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser, aiohttp.ClientSession(window.url) as session:
-            for path, body in CHANGES:
-                async with session.post(path, json=body) as response:
-                    assert response.status == 403
-            async with browser.session.post("/api/pair", data={"token": "x"}) as response:
-                assert response.status == 415
-
-    run(test())
+    async with Browser(window.url) as browser, aiohttp.ClientSession(window.url) as session:
+        for path, body in CHANGES:
+            async with session.post(path, json=body) as response:
+                assert response.status == 403
+        async with browser.session.post("/api/pair", data={"token": "x"}) as response:
+            assert response.status == 415
     assert daemon.status().mode == "idle"
 
 
-def test_another_site_starts_no_reading_either_where_the_browser_tells(
+async def test_another_site_starts_no_reading_either_where_the_browser_tells(
     window: WindowProcess,
 ) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser:
-            for site in ("cross-site", "same-site"):
-                headers = {"Sec-Fetch-Site": site}
-                refused = await browser.refusal("/api/runs", headers=headers)
-                assert refused == (403, "other-origin")
-
-    run(test())
+    async with Browser(window.url) as browser:
+        for site in ("cross-site", "same-site"):
+            headers = {"Sec-Fetch-Site": site}
+            refused = await browser.refusal("/api/runs", headers=headers)
+            assert refused == (403, "other-origin")
 
 
 FORWARDED = [
@@ -117,16 +105,13 @@ FORWARDED = [
 
 
 @pytest.mark.parametrize("headers", FORWARDED, ids=lambda headers: next(iter(headers)))
-def test_a_browser_behind_a_reverse_proxy_is_not_one_of_this_machine(
+async def test_a_browser_behind_a_reverse_proxy_is_not_one_of_this_machine(
     window: WindowProcess, headers: dict[str, str]
 ) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser:
-            assert await browser.refusal("/api/fish", headers=headers) == (401, "not-paired")
-        async with Browser(window.url, "fish.example") as browser:
-            assert await browser.refusal("/api/fish") == (401, "not-paired")
-
-    run(test())
+    async with Browser(window.url) as browser:
+        assert await browser.refusal("/api/fish", headers=headers) == (401, "not-paired")
+    async with Browser(window.url, "fish.example") as browser:
+        assert await browser.refusal("/api/fish") == (401, "not-paired")
 
 
 @pytest.mark.parametrize(
@@ -149,18 +134,15 @@ def test_loopback_is_an_address_of_loopback_on_both_ends(
     assert is_loopback(Request()) is loopback  # type: ignore[arg-type]
 
 
-def test_no_two_requests_are_read_from_one_that_is_smuggled(window: WindowProcess) -> None:
-    async def test() -> None:
-        smuggled = b"POST /api/fish/fish/estop HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
-        both = (
-            b"POST /api/session HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nContent-Length: %d\r\n"
-            b"Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n" % (window.port, len(smuggled))
-        )
-        reader, writer = await asyncio.open_connection("127.0.0.1", window.port)
-        writer.write(both + smuggled)
-        answer = await reader.read()
-        assert answer.startswith(b"HTTP/1.0 400 ")
-        assert answer.count(b"HTTP/") == 1
-        writer.close()
-
-    run(test())
+async def test_no_two_requests_are_read_from_one_that_is_smuggled(window: WindowProcess) -> None:
+    smuggled = b"POST /api/fish/fish/estop HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    both = (
+        b"POST /api/session HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nContent-Length: %d\r\n"
+        b"Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n" % (window.port, len(smuggled))
+    )
+    reader, writer = await asyncio.open_connection("127.0.0.1", window.port)
+    writer.write(both + smuggled)
+    answer = await reader.read()
+    assert answer.startswith(b"HTTP/1.0 400 ")
+    assert answer.count(b"HTTP/") == 1
+    writer.close()

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from rigs.processes import Daemon, wait_until
-from rigs.window_process import Browser, Page, WindowProcess, open_page, run, running_window
+from rigs.window_process import Browser, Page, WindowProcess, open_page, running_window
 
 
 async def start(page: Page, kind: str, **options: Any) -> Any:
@@ -21,33 +21,28 @@ async def end_of(page: Page, job: Any) -> Any:
     return await page.until("job", lambda j: j["id"] == job["id"] and j["state"] != "running")
 
 
-def test_a_recording_is_made_listed_and_drawn(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            job = await start(page, "record", name="first", seconds=0.5, note="a; $(b) 'c'")
-            assert job["command"][:3] == ["fishctl", "record", "first"]
-            ended = await end_of(page, job)
-            assert (ended["state"], ended["exit"]) == ("done", 0), ended["lines"]
-            assert ended["result"]["ticks"] > 0
-            run_ = next(
-                entry for entry in await browser.get("/api/runs") if entry["name"] == "first"
-            )
-            assert run_["about"]["note"] == "a; $(b) 'c'"
-            async with browser.session.get("/api/runs/first/plot.png") as response:
-                assert (response.status, response.content_type) == (200, "image/png")
-                assert (await response.read()).startswith(b"\x89PNG")
-            assert await browser.refusal("/api/runs/none/plot.png") == (409, "job")
-
-    run(test())
+async def test_a_recording_is_made_listed_and_drawn(window: WindowProcess) -> None:
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        job = await start(page, "record", name="first", seconds=0.5, note="a; $(b) 'c'")
+        assert job["command"][:3] == ["fishctl", "record", "first"]
+        ended = await end_of(page, job)
+        assert (ended["state"], ended["exit"]) == ("done", 0), ended["lines"]
+        assert ended["result"]["ticks"] > 0
+        run_ = next(entry for entry in await browser.get("/api/runs") if entry["name"] == "first")
+        assert run_["about"]["note"] == "a; $(b) 'c'"
+        async with browser.session.get("/api/runs/first/plot.png") as response:
+            assert (response.status, response.content_type) == (200, "image/png")
+            assert (await response.read()).startswith(b"\x89PNG")
+        assert await browser.refusal("/api/runs/none/plot.png") == (409, "job")
 
 
-def test_the_duration_of_a_job_does_not_follow_the_unix_clock(
+async def test_the_duration_of_a_job_does_not_follow_the_unix_clock(
     daemon: Daemon, tmp_path: Path
 ) -> None:
     changes = "import time; begin = time.monotonic()\n"
     changes += "time.time = lambda: 1e9 - 100 * (time.monotonic() - begin)"  # set back all the time
 
-    async def test() -> None:
+    with running_window(tmp_path, changes=changes, fish=daemon.endpoint) as process:
         async with Browser(process.url) as browser, open_page(browser) as page:
             job = await start(page, "record", name="backwards", seconds=1.0)
             ended = await end_of(page, job)
@@ -56,88 +51,71 @@ def test_the_duration_of_a_job_does_not_follow_the_unix_clock(
                 entry["elapsed"] for entry in await browser.get("/api/jobs")
             ]
 
-    with running_window(tmp_path, changes=changes, fish=daemon.endpoint) as process:
-        run(test())
+
+async def test_a_recording_is_stopped_and_kept(window: WindowProcess) -> None:
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        job = await start(page, "record", name="endless")
+        await page.until("job", lambda j: "recording to" in "".join(j["lines"]))
+        await page.post(f"/api/jobs/{job['id']}/stop")
+        ended = await end_of(page, job)
+        assert (ended["state"], ended["exit"]) == ("stopped", 0)
+        runs = [entry["name"] for entry in await browser.get("/api/runs")]
+        assert "endless" in runs
+        assert ended["id"] in [entry["id"] for entry in await browser.get("/api/jobs")]
 
 
-def test_a_recording_is_stopped_and_kept(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            job = await start(page, "record", name="endless")
-            await page.until("job", lambda j: "recording to" in "".join(j["lines"]))
-            await page.post(f"/api/jobs/{job['id']}/stop")
-            ended = await end_of(page, job)
-            assert (ended["state"], ended["exit"]) == ("stopped", 0)
-            runs = [entry["name"] for entry in await browser.get("/api/runs")]
-            assert "endless" in runs
-            assert ended["id"] in [entry["id"] for entry in await browser.get("/api/jobs")]
-
-    run(test())
-
-
-def test_an_experiment_takes_the_fish_from_the_page_and_lets_it_rest_when_stopped(
+async def test_an_experiment_takes_the_fish_from_the_page_and_lets_it_rest_when_stopped(
     window: WindowProcess, daemon: Daemon
 ) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            options = {"controller": "square", "parameters": {"frequency": 2}}
-            refused = {"fish": "fish", "kind": "measure", "options": options}
-            await page.swim("sine")
-            await page.post("release")
-            assert await page.refusal("/api/jobs", refused) == (409, "not-driver")
-            await page.swim("sine")
-            job = await start(page, "measure", **options, seconds=60)
-            status = await page.until(
-                "status", lambda s: s["lease"] and s["lease"]["name"] == "measure square"
-            )
-            assert status["lease"]["name"] == "measure square"
-            await page.until("ticks", lambda ticks: ticks[-1]["controller"] == "square")
-            await page.post(f"/api/jobs/{job['id']}/stop")
-            ended = await end_of(page, job)
-            assert (ended["state"], ended["resumable"]) == ("stopped", True)
-
-    run(test())
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        options = {"controller": "square", "parameters": {"frequency": 2}}
+        refused = {"fish": "fish", "kind": "measure", "options": options}
+        await page.swim("sine")
+        await page.post("release")
+        assert await page.refusal("/api/jobs", refused) == (409, "not-driver")
+        await page.swim("sine")
+        job = await start(page, "measure", **options, seconds=60)
+        status = await page.until(
+            "status", lambda s: s["lease"] and s["lease"]["name"] == "measure square"
+        )
+        assert status["lease"]["name"] == "measure square"
+        await page.until("ticks", lambda ticks: ticks[-1]["controller"] == "square")
+        await page.post(f"/api/jobs/{job['id']}/stop")
+        ended = await end_of(page, job)
+        assert (ended["state"], ended["resumable"]) == ("stopped", True)
     assert daemon.status().lease is None
 
 
-def test_an_experiment_shows_what_a_person_would_type_and_leaves_a_thrust_among_the_runs(
+async def test_an_experiment_shows_what_a_person_would_type_and_leaves_a_thrust_among_the_runs(
     window: WindowProcess, daemon: Daemon
 ) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            await page.drive()
-            options = {"controller": "square", "parameters": {"frequency": 1.5}, "seconds": 21}
-            job = await start(page, "measure", **options)
-            shown = f"fishctl measure square --frequency 1.5 --for 21 --endpoint {daemon.endpoint}"
-            assert shlex.join(job["command"]) == shown
-            ended = await end_of(page, job)
-            assert ended["state"] == "done", ended["lines"]
-            (run_,) = [r for r in await browser.get("/api/runs") if r["name"] == job["run"]]
-            result = ended["result"]
-            for key in ("thrust", "thrust_ci95", "total_ci95"):
-                assert run_[key] == result[key] > 0.0
-            assert (run_["state"], ended["resumable"]) == ("finished", False)
-            async with browser.session.get(f"/api/runs/{job['run']}/plot.png") as response:
-                assert (await response.read()).startswith(b"\x89PNG")
-            await page.drive()
-            refused = {"fish": "fish", "kind": "resume", "options": {"run": "none"}}
-            assert await page.refusal("/api/jobs", refused) == (409, "job")
-
-    run(test())
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        await page.drive()
+        options = {"controller": "square", "parameters": {"frequency": 1.5}, "seconds": 21}
+        job = await start(page, "measure", **options)
+        shown = f"fishctl measure square --frequency 1.5 --for 21 --endpoint {daemon.endpoint}"
+        assert shlex.join(job["command"]) == shown
+        ended = await end_of(page, job)
+        assert ended["state"] == "done", ended["lines"]
+        (run_,) = [r for r in await browser.get("/api/runs") if r["name"] == job["run"]]
+        result = ended["result"]
+        for key in ("thrust", "thrust_ci95", "total_ci95"):
+            assert run_[key] == result[key] > 0.0
+        assert (run_["state"], ended["resumable"]) == ("finished", False)
+        async with browser.session.get(f"/api/runs/{job['run']}/plot.png") as response:
+            assert (await response.read()).startswith(b"\x89PNG")
+        await page.drive()
+        refused = {"fish": "fish", "kind": "resume", "options": {"run": "none"}}
+        assert await page.refusal("/api/jobs", refused) == (409, "job")
 
 
-def test_a_simulated_fish_swims_first_and_its_curve_is_drawn(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            job = await start(
-                page, "simulate", controller="swing", parameters={"C": 0.5}, seconds=12
-            )
-            result = (await end_of(page, job))["result"]
-            assert result["parameters"]["C"] == 0.5
-            curve = result["curve"]
-            assert len(curve["time"]) == len(curve["fx"]) == len(curve["alpha"]) == result["ticks"]
-
-    run(test())
+async def test_a_simulated_fish_swims_first_and_its_curve_is_drawn(window: WindowProcess) -> None:
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        job = await start(page, "simulate", controller="swing", parameters={"C": 0.5}, seconds=12)
+        result = (await end_of(page, job))["result"]
+        assert result["parameters"]["C"] == 0.5
+        curve = result["curve"]
+        assert len(curve["time"]) == len(curve["fx"]) == len(curve["alpha"]) == result["ticks"]
 
 
 @pytest.mark.parametrize(
@@ -166,57 +144,44 @@ def test_a_simulated_fish_swims_first_and_its_curve_is_drawn(window: WindowProce
         ("simulate", {"controller": "square", "jobs": 9}, "bad-arguments"),
     ],
 )
-def test_neither_words_of_a_command_line_nor_impossible_times_come_from_a_page(
+async def test_neither_words_of_a_command_line_nor_impossible_times_come_from_a_page(
     window: WindowProcess, kind: str, options: Any, code: str
 ) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            await page.drive()
-            body = {"fish": "fish", "kind": kind, "options": options}
-            assert await page.refusal("/api/jobs", body) == (400, code)
-
-    run(test())
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        await page.drive()
+        body = {"fish": "fish", "kind": kind, "options": options}
+        assert await page.refusal("/api/jobs", body) == (400, code)
 
 
-def test_a_job_that_fails_says_why(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            ended = await end_of(page, await start(page, "rerun", run="none"))
-            assert (ended["state"], ended["exit"]) == ("failed", 1)
-            assert "none" in ended["lines"][-1]
-            assert await page.refusal("/api/jobs/99/stop") == (409, "job")
-
-    run(test())
+async def test_a_job_that_fails_says_why(window: WindowProcess) -> None:
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        ended = await end_of(page, await start(page, "rerun", run="none"))
+        assert (ended["state"], ended["exit"]) == ("failed", 1)
+        assert "none" in ended["lines"][-1]
+        assert await page.refusal("/api/jobs/99/stop") == (409, "job")
 
 
-def test_an_experiment_that_is_lost_with_its_window_is_listed_by_the_next_one_and_resumed(
+async def test_an_experiment_that_is_lost_with_its_window_is_listed_by_the_next_one_and_resumed(
     new_window: WindowProcess, daemon: Daemon, tmp_path: Path
 ) -> None:
-    async def lose() -> None:
-        async with Browser(new_window.url) as browser, open_page(browser) as page:
-            await page.drive()
-            await start(page, "measure", controller="square", seconds=21)
-            await page.until("ticks", lambda ticks: ticks[-1]["controller"] == "square")
-            os.kill(new_window.pid, signal.SIGKILL)
-
-    run(lose())
+    async with Browser(new_window.url) as browser, open_page(browser) as page:
+        await page.drive()
+        await start(page, "measure", controller="square", seconds=21)
+        await page.until("ticks", lambda ticks: ticks[-1]["controller"] == "square")
+        os.kill(new_window.pid, signal.SIGKILL)
     wait_until(lambda: daemon.status().mode == "idle" and daemon.status().lease is None)
     with running_window(tmp_path, fish=daemon.endpoint) as window:
-
-        async def resume() -> None:
-            async with Browser(window.url) as browser, open_page(browser) as page:
-                (lost,) = page.hello["jobs"]
-                assert (lost["state"], lost["resumable"]) == ("lost", True)
-                assert "the fish came to rest; what was measured until then" in lost["lines"][-1]
-                await page.drive()
-                job = await start(page, "resume", run=lost["run"])
-                assert job["command"][:3] == ["fishctl", "measure", "--resume"]
-                await page.until("job", lambda j: j["id"] == lost["id"] and not j["resumable"])
-                await page.until("ticks", lambda ticks: ticks[-1]["controller"] == "square")
-                await page.post(f"/api/jobs/{job['id']}/stop")
-                assert (await end_of(page, job))["state"] == "stopped"
-            assert list(window.state.glob("window-*.json")) == [
-                window.state / f"window-{window.pid}.json"
-            ]
-
-        run(resume())
+        async with Browser(window.url) as browser, open_page(browser) as page:
+            (lost,) = page.hello["jobs"]
+            assert (lost["state"], lost["resumable"]) == ("lost", True)
+            assert "the fish came to rest; what was measured until then" in lost["lines"][-1]
+            await page.drive()
+            job = await start(page, "resume", run=lost["run"])
+            assert job["command"][:3] == ["fishctl", "measure", "--resume"]
+            await page.until("job", lambda j: j["id"] == lost["id"] and not j["resumable"])
+            await page.until("ticks", lambda ticks: ticks[-1]["controller"] == "square")
+            await page.post(f"/api/jobs/{job['id']}/stop")
+            assert (await end_of(page, job))["state"] == "stopped"
+        assert list(window.state.glob("window-*.json")) == [
+            window.state / f"window-{window.pid}.json"
+        ]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from rigs.window_process import Browser, WindowProcess, run
+from rigs.window_process import Browser, WindowProcess
 
 from fishd.window.pictures import MAX_PICTURE_BYTES
 
@@ -73,46 +73,40 @@ def picture(window: WindowProcess) -> Path:
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_a_page_gets_nothing_but_a_regular_picture_in_the_folder_of_a_run(
+async def test_a_page_gets_nothing_but_a_regular_picture_in_the_folder_of_a_run(
     window: WindowProcess, picture: Path, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(picture.parent)
     make, problem = REFUSED[what]
     make(picture)
 
-    async def test() -> None:
-        async with (
-            Browser(window.url) as browser,
-            browser.session.get(f"/api/runs/{picture.parent.name}/plot.png") as response,
-        ):
-            body = await response.read()
-            assert response.status == 409
-            assert problem.replace("measure-1", picture.parent.name) in body.decode()
-            assert SECRET not in body
-
-    run(test())
+    async with (
+        Browser(window.url) as browser,
+        browser.session.get(f"/api/runs/{picture.parent.name}/plot.png") as response,
+    ):
+        body = await response.read()
+        assert response.status == 409
+        assert problem.replace("measure-1", picture.parent.name) in body.decode()
+        assert SECRET not in body
 
 
-def test_a_picture_of_the_largest_size_is_served_whole_to_each_who_asks_at_once(
+async def test_a_picture_of_the_largest_size_is_served_whole_to_each_who_asks_at_once(
     window: WindowProcess, picture: Path
 ) -> None:
     write_sparse(picture, MAX_PICTURE_BYTES)
     before = peak_memory(window)
 
-    async def test() -> None:
-        async with Browser(window.url) as browser:
-            path = f"/api/runs/{picture.parent.name}/plot.png"
-            responses = [await browser.session.get(path) for _ in range(12)]
-            for response in responses:
-                assert (response.status, response.content_type) == (200, "image/png")
-                size = 0
-                async for chunk in response.content.iter_any():
-                    size += len(chunk)
-                assert size == response.content_length == MAX_PICTURE_BYTES
-            response = await browser.session.head(path)
-            assert (response.status, response.content_length) == (200, MAX_PICTURE_BYTES)
-
-    run(test())
+    async with Browser(window.url) as browser:
+        path = f"/api/runs/{picture.parent.name}/plot.png"
+        responses = [await browser.session.get(path) for _ in range(12)]
+        for response in responses:
+            assert (response.status, response.content_type) == (200, "image/png")
+            size = 0
+            async for chunk in response.content.iter_any():
+                size += len(chunk)
+            assert size == response.content_length == MAX_PICTURE_BYTES
+        response = await browser.session.head(path)
+        assert (response.status, response.content_length) == (200, MAX_PICTURE_BYTES)
     assert peak_memory(window) - before < MAX_PICTURE_BYTES
 
 

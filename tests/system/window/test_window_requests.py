@@ -8,93 +8,77 @@ from typing import Any
 
 import pytest
 from rigs.processes import Daemon
-from rigs.window_process import Browser, WindowProcess, open_page, run
+from rigs.window_process import Browser, WindowProcess, open_page
 
 from fishd.core.signals import Tick
 
 
-def test_a_page_begins_with_all_that_it_needs(new_window: WindowProcess) -> None:
-    async def test() -> None:
-        async with Browser(new_window.url) as browser, open_page(browser) as page:
-            hello = page.hello
-            assert hello["fish"] == ["fish"]
-            assert hello["session"]["scope"] == "drive"
-            assert hello["session"]["loopback"]
-            assert (hello["driver"], hello["you_drive"]) == (None, False)
-            assert hello["status"]["robot"] == "simulated"
-            square = next(info for info in hello["controllers"] if info["name"] == "square")
-            frequency = next(
-                field for field in square["parameters"] if field["name"] == "frequency"
-            )
-            assert (frequency["low"], frequency["high"], frequency["unit"]) == (0.001, 10, "Hz")
-            assert frequency["step"] == 0.05
-
-    run(test())
+async def test_a_page_begins_with_all_that_it_needs(new_window: WindowProcess) -> None:
+    async with Browser(new_window.url) as browser, open_page(browser) as page:
+        hello = page.hello
+        assert hello["fish"] == ["fish"]
+        assert hello["session"]["scope"] == "drive"
+        assert hello["session"]["loopback"]
+        assert (hello["driver"], hello["you_drive"]) == (None, False)
+        assert hello["status"]["robot"] == "simulated"
+        square = next(info for info in hello["controllers"] if info["name"] == "square")
+        frequency = next(field for field in square["parameters"] if field["name"] == "frequency")
+        assert (frequency["low"], frequency["high"], frequency["unit"]) == (0.001, 10, "Hz")
+        assert frequency["step"] == 0.05
 
 
-def test_ticks_come_in_order_and_continue_the_history(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            await page.until("ticks")
-            await page.sock.close()
-            async with open_page(browser) as later:
-                seqs: list[int] = []
+async def test_ticks_come_in_order_and_continue_the_history(window: WindowProcess) -> None:
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        await page.until("ticks")
+        await page.sock.close()
+        async with open_page(browser) as later:
+            seqs: list[int] = []
+            kind, payload = await later.message()
+            while kind != "ticks":
+                if kind == "history":
+                    assert set(payload) <= set(Tick.__struct_fields__)
+                    sizes = {len(payload[name]) for name in ("seq", "t", "fx", "phi_c")}
+                    assert sizes == {len(payload["seq"])}
+                    seqs += payload["seq"]
                 kind, payload = await later.message()
-                while kind != "ticks":
-                    if kind == "history":
-                        assert set(payload) <= set(Tick.__struct_fields__)
-                        sizes = {len(payload[name]) for name in ("seq", "t", "fx", "phi_c")}
-                        assert sizes == {len(payload["seq"])}
-                        seqs += payload["seq"]
-                    kind, payload = await later.message()
-                for _ in range(5):
-                    seqs += [tick["seq"] for tick in payload]
-                    payload = await later.until("ticks")
-                assert seqs == list(range(seqs[0], seqs[-1] + 1))
-
-    run(test())
+            for _ in range(5):
+                seqs += [tick["seq"] for tick in payload]
+                payload = await later.until("ticks")
+            assert seqs == list(range(seqs[0], seqs[-1] + 1))
 
 
-def test_the_driver_swims_tunes_marks_tares_and_stops_the_fish(
+async def test_the_driver_swims_tunes_marks_tares_and_stops_the_fish(
     window: WindowProcess, daemon: Daemon
 ) -> None:
     daemon.wait_until_still()
 
-    async def test() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            await page.drive()
-            tared = await page.request("tare", seconds=0.2)
-            assert tared["force"]["x0"] != 0.0
-            state = await page.request(
-                "set-controller", name="square", parameters={"frequency": 1.5}
-            )
-            assert (state["mode"], state["controller"]) == ("running", "square")
-            state = await page.request("set-parameters", parameters={"frequency": 2})
-            assert state["parameters"]["frequency"] == 2.0
-            await page.request("mark", text="water changed")
-            event = await page.until("event", lambda event: event["kind"] == "mark")
-            assert event["message"] == "water changed"
-            state = await page.request("stop")
-            assert state["mode"] == "idle"
-            await page.until_at_rest()
-
-    run(test())
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        await page.drive()
+        tared = await page.request("tare", seconds=0.2)
+        assert tared["force"]["x0"] != 0.0
+        state = await page.request("set-controller", name="square", parameters={"frequency": 1.5})
+        assert (state["mode"], state["controller"]) == ("running", "square")
+        state = await page.request("set-parameters", parameters={"frequency": 2})
+        assert state["parameters"]["frequency"] == 2.0
+        await page.request("mark", text="water changed")
+        event = await page.until("event", lambda event: event["kind"] == "mark")
+        assert event["message"] == "water changed"
+        state = await page.request("stop")
+        assert state["mode"] == "idle"
+        await page.until_at_rest()
 
 
-def test_an_emergency_stop_needs_no_driver_and_is_cleared(
+async def test_an_emergency_stop_needs_no_driver_and_is_cleared(
     window: WindowProcess, daemon: Daemon
 ) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            await page.swim()
-            async with Browser(window.url) as other:
-                result = await other.post("/api/fish/fish/estop")
-            assert result["way"] == "control"
-            assert result["server_ms"] > 0.0
-            assert daemon.status().reason.code == "estop"  # type: ignore[union-attr]
-            assert (await page.request("clear-fault"))["mode"] == "idle"
-
-    run(test())
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        await page.swim()
+        async with Browser(window.url) as other:
+            result = await other.post("/api/fish/fish/estop")
+        assert result["way"] == "control"
+        assert result["server_ms"] > 0.0
+        assert daemon.status().reason.code == "estop"  # type: ignore[union-attr]
+        assert (await page.request("clear-fault"))["mode"] == "idle"
 
 
 @pytest.mark.parametrize(
@@ -112,23 +96,20 @@ def test_an_emergency_stop_needs_no_driver_and_is_cleared(
         ([], 400, "bad-arguments"),
     ],
 )
-def test_a_wrong_request_is_answered_with_its_mistake(
+async def test_a_wrong_request_is_answered_with_its_mistake(
     window: WindowProcess, body: Any, status: int, code: str
 ) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            await page.drive()
-            if body == []:
-                async with browser.session.post(
-                    "/api/fish/fish/request", data=b"[]",
-                    headers={"X-Client": page.hello["client"], "Content-Type": "application/json"},
-                ) as response:  # fmt: skip
-                    answer = json.loads(await response.read())
-                    assert (response.status, answer["error"]["code"]) == (status, code)
-            else:
-                assert await page.refusal("request", body) == (status, code)
-
-    run(test())
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        await page.drive()
+        if body == []:
+            async with browser.session.post(
+                "/api/fish/fish/request", data=b"[]",
+                headers={"X-Client": page.hello["client"], "Content-Type": "application/json"},
+            ) as response:  # fmt: skip
+                answer = json.loads(await response.read())
+                assert (response.status, answer["error"]["code"]) == (status, code)
+        else:
+            assert await page.refusal("request", body) == (status, code)
 
 
 @pytest.mark.parametrize(
@@ -140,50 +121,43 @@ def test_a_wrong_request_is_answered_with_its_mistake(
         (f"/api/runs/{'a' * 300}/plot.png", 409, "job"),
     ],
 )
-def test_wrong_paths_get_json(window: WindowProcess, path: str, status: int, code: str) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser:
-            assert await browser.refusal(path) == (status, code)
-
-    run(test())
-
-
-def test_a_request_from_no_open_page_or_not_in_json_is_refused(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as browser:
-            assert await browser.refusal("/api/fish/fish/drive", {}) == (409, "no-page")
-            wrong = {"Content-Type": "text/plain", "X-Client": "x"}
-            async with browser.session.post(
-                "/api/fish/fish/drive", data=b"{}", headers=wrong
-            ) as response:
-                assert response.status == 415
-            async with browser.session.post(
-                "/api/pair", data=bytes(20_000), headers={"Content-Type": "application/json"}
-            ) as response:
-                assert response.status == 413
-
-    run(test())
+async def test_wrong_paths_get_json(
+    window: WindowProcess, path: str, status: int, code: str
+) -> None:
+    async with Browser(window.url) as browser:
+        assert await browser.refusal(path) == (status, code)
 
 
-def test_the_files_of_the_page_are_compressed_once_and_sent_again_only_if_changed(
+async def test_a_request_from_no_open_page_or_not_in_json_is_refused(window: WindowProcess) -> None:
+    async with Browser(window.url) as browser:
+        assert await browser.refusal("/api/fish/fish/drive", {}) == (409, "no-page")
+        wrong = {"Content-Type": "text/plain", "X-Client": "x"}
+        async with browser.session.post(
+            "/api/fish/fish/drive", data=b"{}", headers=wrong
+        ) as response:
+            assert response.status == 415
+        async with browser.session.post(
+            "/api/pair", data=bytes(20_000), headers={"Content-Type": "application/json"}
+        ) as response:
+            assert response.status == 413
+
+
+async def test_the_files_of_the_page_are_compressed_once_and_sent_again_only_if_changed(
     window: WindowProcess,
 ) -> None:
     name = "vendor/uPlot-1.6.32.min.js"
     content = resources.files("fishd.window").joinpath("page", name).read_bytes()
 
-    async def test() -> None:
-        async with Browser(window.url) as browser:
-            headers = {"Accept-Encoding": "gzip"}
-            session = browser.session
-            async with session.get(f"/{name}", headers=headers) as response:
-                assert response.headers["Content-Encoding"] == "gzip"
-                assert "default-src 'none'" in response.headers["Content-Security-Policy"]
-                assert await response.read() == content
-                tag = response.headers["ETag"]
-            async with session.get(f"/{name}", headers={"If-None-Match": tag}) as response:
-                assert (response.status, await response.read()) == (304, b"")
-
-    run(test())
+    async with Browser(window.url) as browser:
+        headers = {"Accept-Encoding": "gzip"}
+        session = browser.session
+        async with session.get(f"/{name}", headers=headers) as response:
+            assert response.headers["Content-Encoding"] == "gzip"
+            assert "default-src 'none'" in response.headers["Content-Security-Policy"]
+            assert await response.read() == content
+            tag = response.headers["ETag"]
+        async with session.get(f"/{name}", headers={"If-None-Match": tag}) as response:
+            assert (response.status, await response.read()) == (304, b"")
     assert len(gzip.compress(content)) < 25_000
 
 

@@ -16,7 +16,6 @@ from rigs.window_process import (
     Page,
     WindowProcess,
     open_page,
-    run,
     running_window,
 )
 
@@ -107,148 +106,129 @@ def start_job(page: Page, kind: str, **options: Any) -> Awaitable[Any]:
 
 
 @pytest.mark.parametrize("revoke", WAYS)
-def test_a_fish_that_keeps_swimming_for_a_revoked_device_comes_to_rest(
+async def test_a_fish_that_keeps_swimming_for_a_revoked_device_comes_to_rest(
     new_window: WindowProcess, daemon: Daemon, revoke: Any
 ) -> None:
-    async def test() -> None:
-        async with paired(new_window, "stolen") as browser, open_page(browser) as page:
-            await page.swim()
-            await page.post("drive", {"keep": True})
-            await revoke(new_window, browser, "stolen")
-            await asyncio.to_thread(wait_until, lambda: daemon.status().mode == "idle")
-            assert daemon.status().lease is None
-            while not page.sock.closed:
-                await page.sock.receive()
-
-    run(test())
+    async with paired(new_window, "stolen") as browser, open_page(browser) as page:
+        await page.swim()
+        await page.post("drive", {"keep": True})
+        await revoke(new_window, browser, "stolen")
+        await asyncio.to_thread(wait_until, lambda: daemon.status().mode == "idle")
+        assert daemon.status().lease is None
+        while not page.sock.closed:
+            await page.sock.receive()
 
 
-def test_a_fish_that_swims_on_after_its_page_has_left_rests_once_the_device_is_revoked(
+async def test_a_fish_that_swims_on_after_its_page_has_left_rests_once_the_device_is_revoked(
     daemon: Daemon, tmp_path: Path
 ) -> None:
     with running_window(tmp_path, changes=HASTE, fish=daemon.endpoint) as window:
-
-        async def test() -> None:
-            async with (
-                Browser(window.url) as here,
-                open_page(here) as watcher,
-                paired(window, "left") as browser,
-                open_page(browser) as page,
-            ):
-                await page.swim()
-                await page.post("drive", {"keep": True})
-                await page.sock.close()
-                window.process.send_signal(signal.SIGUSR1)
-                await watcher.until("driver", lambda driver: driver is None)
-                for _ in range(20):
-                    ticks = await watcher.until("ticks")
-                assert ticks[-1]["mode"] == "running"
-                await revoke_by_command(window, browser, "left")
-                await watcher.until_at_rest()
-
-        run(test())
+        async with (
+            Browser(window.url) as here,
+            open_page(here) as watcher,
+            paired(window, "left") as browser,
+            open_page(browser) as page,
+        ):
+            await page.swim()
+            await page.post("drive", {"keep": True})
+            await page.sock.close()
+            window.process.send_signal(signal.SIGUSR1)
+            await watcher.until("driver", lambda driver: driver is None)
+            for _ in range(20):
+                ticks = await watcher.until("ticks")
+            assert ticks[-1]["mode"] == "running"
+            await revoke_by_command(window, browser, "left")
+            await watcher.until_at_rest()
         assert daemon.status().lease is None
 
 
-def test_a_revoked_device_does_not_stop_a_fish_that_another_one_drives_since(
+async def test_a_revoked_device_does_not_stop_a_fish_that_another_one_drives_since(
     new_window: WindowProcess, daemon: Daemon
 ) -> None:
-    async def test() -> None:
-        async with Browser(new_window.url) as here, open_page(here) as other:
-            async with paired(new_window, "former") as browser, open_page(browser) as page:
-                await page.swim()
-                await other.drive()
-                await revoke_by_command(new_window, browser, "former")
-                while not page.sock.closed:
-                    await page.sock.receive()
-            later = daemon.status().seq + 20
-            ticks = await other.until("ticks", lambda ticks: ticks[-1]["seq"] > later)
-            assert ticks[-1]["mode"] == "running"
-
-    run(test())
+    async with Browser(new_window.url) as here, open_page(here) as other:
+        async with paired(new_window, "former") as browser, open_page(browser) as page:
+            await page.swim()
+            await other.drive()
+            await revoke_by_command(new_window, browser, "former")
+            while not page.sock.closed:
+                await page.sock.receive()
+        later = daemon.status().seq + 20
+        ticks = await other.until("ticks", lambda ticks: ticks[-1]["seq"] > later)
+        assert ticks[-1]["mode"] == "running"
 
 
-def test_the_experiments_of_a_revoked_device_end_and_those_of_others_go_on(
+async def test_the_experiments_of_a_revoked_device_end_and_those_of_others_go_on(
     new_window: WindowProcess, daemon: Daemon
 ) -> None:
-    async def test() -> None:
-        async with Browser(new_window.url) as here, open_page(here) as watcher:
-            mine = await start_job(watcher, "record", name="mine")
-            async with paired(new_window, "stolen") as browser, open_page(browser) as page:
-                await page.drive()
-                recording = await start_job(page, "record", name="theirs")
-                measurement = await start_job(page, "measure", controller="square", seconds=60)
-                await watcher.until("status", lambda status: status["lease"])
-                await watcher.until("ticks", lambda ticks: ticks[-1]["mode"] == "running")
-                await revoke_by_command(new_window, browser, "stolen")
-                states: dict[str, Any] = {}
-                while len(states) < 2:
-                    job = await watcher.until("job", lambda job: job["state"] != "running")
-                    assert "stopped: the device that started it was revoked" in job["lines"]
-                    states[job["id"]] = job["state"]
-            assert states == {recording["id"]: "stopped", measurement["id"]: "stopped"}
-            (going,) = [job for job in await here.get("/api/jobs") if job["state"] == "running"]
-            assert going["id"] == mine["id"]
-            (ended,) = [j for j in await here.get("/api/jobs") if j["id"] == measurement["id"]]
-            assert ended["resumable"]
-
-    run(test())
+    async with Browser(new_window.url) as here, open_page(here) as watcher:
+        mine = await start_job(watcher, "record", name="mine")
+        async with paired(new_window, "stolen") as browser, open_page(browser) as page:
+            await page.drive()
+            recording = await start_job(page, "record", name="theirs")
+            measurement = await start_job(page, "measure", controller="square", seconds=60)
+            await watcher.until("status", lambda status: status["lease"])
+            await watcher.until("ticks", lambda ticks: ticks[-1]["mode"] == "running")
+            await revoke_by_command(new_window, browser, "stolen")
+            states: dict[str, Any] = {}
+            while len(states) < 2:
+                job = await watcher.until("job", lambda job: job["state"] != "running")
+                assert "stopped: the device that started it was revoked" in job["lines"]
+                states[job["id"]] = job["state"]
+        assert states == {recording["id"]: "stopped", measurement["id"]: "stopped"}
+        (going,) = [job for job in await here.get("/api/jobs") if job["state"] == "running"]
+        assert going["id"] == mine["id"]
+        (ended,) = [j for j in await here.get("/api/jobs") if j["id"] == measurement["id"]]
+        assert ended["resumable"]
     assert (daemon.status().mode, daemon.status().lease) == ("idle", None)
 
 
-def test_a_revoked_device_whose_controller_still_loads_stops_at_once_and_does_not_start_again(
+async def test_a_revoked_device_whose_controller_still_loads_stops_at_once_and_does_not_start_again(
     new_window: WindowProcess, daemon: Daemon, site: Path
 ) -> None:
     (site / "go_on").unlink(missing_ok=True)
     waiting = {"op": "set-controller", "args": {"name": "waiting"}}
     square = {"op": "set-controller", "args": {"name": "square"}}
 
-    async def test() -> None:
-        async with paired(new_window, "slow") as browser, open_page(browser) as page:
-            await page.swim()
-            loading = asyncio.create_task(page.refusal("request", waiting))
-            queued = [asyncio.create_task(page.refusal("request", square)) for _ in range(3)]
-            await page.until("ticks")
-            await revoke_by_command(new_window, browser, "slow")
-            await asyncio.to_thread(wait_until, lambda: daemon.status().mode == "idle")
-            assert not loading.done()
-            (site / "go_on").touch()
-            assert await loading in ((409, "superseded"), (409, "no-lease"), (409, "not-driver"))
-            assert {await refusal for refusal in queued} == {(409, "not-driver")}
-
-    run(test())
+    async with paired(new_window, "slow") as browser, open_page(browser) as page:
+        await page.swim()
+        loading = asyncio.create_task(page.refusal("request", waiting))
+        queued = [asyncio.create_task(page.refusal("request", square)) for _ in range(3)]
+        await page.until("ticks")
+        await revoke_by_command(new_window, browser, "slow")
+        await asyncio.to_thread(wait_until, lambda: daemon.status().mode == "idle")
+        assert not loading.done()
+        (site / "go_on").touch()
+        assert await loading in ((409, "superseded"), (409, "no-lease"), (409, "not-driver"))
+        assert {await refusal for refusal in queued} == {(409, "not-driver")}
     assert (daemon.status().mode, daemon.status().lease) == ("idle", None)
 
 
-def test_a_job_that_waited_for_the_disk_does_not_start_once_its_device_is_revoked_or_replaced(
+async def test_a_job_that_waited_for_the_disk_does_not_start_once_its_device_is_revoked_or_replaced(
     daemon: Daemon, tmp_path: Path
 ) -> None:
     with running_window(tmp_path, changes=SLOW_DISK, fish=daemon.endpoint) as window:
         stdout = window.process.stdout
         assert stdout
 
-        async def test() -> None:
-            async with (
-                Browser(window.url) as here,
-                open_page(here) as page,
-                open_page(here) as other,
-                paired(window, "stolen") as browser,
-                open_page(browser) as theirs,
-            ):
-                body: dict[str, Any] = {"fish": "fish", "kind": "record"}
-                revoked = asyncio.create_task(theirs.refusal("/api/jobs", body))
-                assert await asyncio.to_thread(stdout.readline)
-                await page.drive()
-                body = {"fish": "fish", "kind": "measure", "options": {"controller": "square"}}
-                replaced = asyncio.create_task(page.refusal("/api/jobs", body))
-                await revoke_by_command(window, browser, "stolen")
-                while not theirs.sock.closed:
-                    await theirs.sock.receive()
-                await asyncio.sleep(0.2)
-                await other.drive()
-                window.process.send_signal(signal.SIGUSR1)
-                assert await revoked == (401, "not-paired")
-                assert await replaced == (409, "not-driver")
-                assert await here.get("/api/jobs") == []
-
-        run(test())
+        async with (
+            Browser(window.url) as here,
+            open_page(here) as page,
+            open_page(here) as other,
+            paired(window, "stolen") as browser,
+            open_page(browser) as theirs,
+        ):
+            body: dict[str, Any] = {"fish": "fish", "kind": "record"}
+            revoked = asyncio.create_task(theirs.refusal("/api/jobs", body))
+            assert await asyncio.to_thread(stdout.readline)
+            await page.drive()
+            body = {"fish": "fish", "kind": "measure", "options": {"controller": "square"}}
+            replaced = asyncio.create_task(page.refusal("/api/jobs", body))
+            await revoke_by_command(window, browser, "stolen")
+            while not theirs.sock.closed:
+                await theirs.sock.receive()
+            await asyncio.sleep(0.2)
+            await other.drive()
+            window.process.send_signal(signal.SIGUSR1)
+            assert await revoked == (401, "not-paired")
+            assert await replaced == (409, "not-driver")
+            assert await here.get("/api/jobs") == []

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line, wait_until
-from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
+from rigs.window_process import Browser, WindowProcess, open_page, running_window
 
 
 def test_a_page_that_runs_is_opened_and_not_started_again(window: WindowProcess) -> None:
@@ -15,7 +15,9 @@ def test_a_page_that_runs_is_opened_and_not_started_again(window: WindowProcess)
     assert (done.returncode, done.stdout) == (0, f"the fish is at {window.url}/\n")
 
 
-def test_a_page_that_does_not_run_is_started_until_ctrl_c(daemon: Daemon, tmp_path: Path) -> None:
+async def test_a_page_that_does_not_run_is_started_until_ctrl_c(
+    daemon: Daemon, tmp_path: Path
+) -> None:
     options = ["--listen", "127.0.0.1:0", "--state", str(tmp_path)]
     with Process(FISHCTL, "--endpoint", daemon.endpoint, "window", "open", *options) as process:
         assert process.process.stdout
@@ -23,11 +25,8 @@ def test_a_page_that_does_not_run_is_started_until_ctrl_c(daemon: Daemon, tmp_pa
         match = re.fullmatch(r"the fish is at (http://127\.0\.0\.1:\d+)/\n", line)
         assert match
 
-        async def test() -> None:
-            async with Browser(match[1]) as browser, open_page(browser) as page:
-                await page.until("ticks")
-
-        run(test())
+        async with Browser(match[1]) as browser, open_page(browser) as page:
+            await page.until("ticks")
         assert process.end(signal.SIGINT)[0] == 0
 
 
@@ -58,20 +57,17 @@ def test_a_wrong_key_is_named_with_its_line(tmp_path: Path) -> None:
     assert re.search(r"window\.yaml:2: fishes: unknown key; did you mean 'fish'\?", line)
 
 
-def test_the_end_of_the_window_stops_its_fish_and_its_experiments(
+async def test_the_end_of_the_window_stops_its_fish_and_its_experiments(
     new_window: WindowProcess, daemon: Daemon, tmp_path: Path
 ) -> None:
-    async def test() -> None:
-        async with Browser(new_window.url) as browser, open_page(browser) as page:
-            job = {"fish": "fish", "kind": "record", "options": {"name": "endless"}}
-            await page.post("/api/jobs", job)
-            await page.until("job", lambda j: "recording to" in "".join(j["lines"]))
-            await page.swim()
-            new_window.process.send_signal(signal.SIGTERM)
-            while not page.sock.closed:
-                await page.sock.receive()
-
-    run(test())
+    async with Browser(new_window.url) as browser, open_page(browser) as page:
+        job = {"fish": "fish", "kind": "record", "options": {"name": "endless"}}
+        await page.post("/api/jobs", job)
+        await page.until("job", lambda j: "recording to" in "".join(j["lines"]))
+        await page.swim()
+        new_window.process.send_signal(signal.SIGTERM)
+        while not page.sock.closed:
+            await page.sock.receive()
     new_window.process.wait()
     assert new_window.process.returncode == 0
     wait_until(lambda: daemon.status().mode == "idle")

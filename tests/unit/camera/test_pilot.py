@@ -9,7 +9,7 @@ from rigs.harness import observe
 from rigs.policy_files import FLIP, of_pixels, seeing_card, write
 
 from fishd.controllers.base import Limits
-from fishd.controllers.policy.pilot import HOLD_TIME_S, Pilot
+from fishd.controllers.policy.runtime import HOLD_TIME_S, Pilot
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import ControllerFault, PolicyError
 

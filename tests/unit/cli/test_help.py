@@ -48,6 +48,7 @@ for words, _ in commands(fishctl):
 """
 
 
+@pytest.mark.slow
 def test_the_help_of_every_verb_needs_the_extra_lab_at_most() -> None:
     folders = [str(folder) for folder in sys.path if folder]
     code = f"import sys; sys.path[:] = {folders!r}\n{WITHOUT_EXTRAS}"

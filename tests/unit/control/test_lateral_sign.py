@@ -61,7 +61,7 @@ def test_a_reversed_force_is_detected_on_any_fish_when_it_sets_off(seed: int) ->
 def test_a_reversed_force_is_detected_at_other_ticks_too(tick: float) -> None:
     right = Rig(f"tick={tick}")
     assert detect_reversal(right) is False
-    assert right.loop.perception.lateral_sign.complaint == ""
+    assert right.loop.perception.lateral_sign.complaint is None
     assert "calibration" not in right.recorder.kinds()
     assert detect_reversal(Rig(f"tick={tick}", wrap=reversed_robot)) is True
 
@@ -94,7 +94,7 @@ def test_a_push_with_a_suspect_force_decides_nothing(tick: int) -> None:
         rig.run(tick)
     robot.fy, robot.suspect = 5.0, "F_y is clipped"
     rig.run(1)
-    robot.fy, robot.suspect = None, ""
+    robot.fy, robot.suspect = None, None
     rig.start("swing")
     rig.run_for(1.0)
     assert rig.loop.perception.lateral_sign.reversed is None
@@ -127,7 +127,7 @@ def test_a_new_calibration_resets_the_sign_and_a_tare_requires_a_rest() -> None:
     assert rig.loop.perception.estimator.fy_corrected
     rig.loop.perception.forget_force(scale=True)
     assert rig.run()[0].fy_corrected is UNSET
-    assert rig.loop.perception.lateral_sign.complaint == ""
+    assert rig.loop.perception.lateral_sign.complaint is None
     rig.loop.stop()
     rig.run_for(REST_S)
     rig.loop.perception.lateral_sign.rest()

@@ -162,7 +162,7 @@ def clip(rig: Rig, robot: Wrapped, fx: float) -> None:
     """Run one tick with a suspect force."""
     robot.fx, robot.suspect = fx, "F_x is clipped"
     rig.run(1)
-    robot.fx, robot.suspect = None, ""
+    robot.fx, robot.suspect = None, None
 
 
 def test_beats_that_are_old_because_of_suspect_forces_are_not_shown() -> None:

@@ -185,7 +185,7 @@ def test_a_suspect_force_that_a_slow_sensor_repeats_reaches_no_estimator() -> No
     good = rig.run(10)[-1]
     robot.fx, robot.fy, robot.suspect = 1.0, 5.0, "F_y is clipped"
     rig.run(1)
-    robot.suspect, robot.samples = "", 0
+    robot.suspect, robot.samples = None, 0
     tick = rig.run(1)[-1]
     assert (tick.fx, tick.fy, tick.samples) == (good.fx, good.fy, 0)
     assert tick.sample_age_ms < 10.0

@@ -22,12 +22,12 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("mode", MODES_OF_OTHERS, ids=oct)
 def test_a_folder_that_others_may_write_is_named_with_its_remedy(folder: Path, mode: int) -> None:
-    assert find_folder_problem(folder) == ""
+    assert find_folder_problem(folder) is None
     folder.chmod(mode)
     remedy = f"{folder}: other users may change it (mode {mode:o}); run 'chmod go-w {folder}'"
     assert find_folder_problem(folder) == remedy
     folder.chmod(mode & ~0o022)
-    assert find_folder_problem(folder) == ""
+    assert find_folder_problem(folder) is None
 
 
 def test_a_folder_on_the_way_lets_others_replace_it_unless_it_is_sticky(folder: Path) -> None:
@@ -35,7 +35,7 @@ def test_a_folder_on_the_way_lets_others_replace_it_unless_it_is_sticky(folder: 
     problem = find_folder_problem(folder)
     assert f"and so replace {folder} (mode 777); run 'chmod go-w {folder.parent}'" in problem
     folder.parent.chmod(0o1777)
-    assert find_folder_problem(folder) == ""
+    assert find_folder_problem(folder) is None
 
 
 def test_a_link_is_followed_and_whatever_others_may_replace_on_its_way_is_named(
@@ -43,7 +43,7 @@ def test_a_link_is_followed_and_whatever_others_may_replace_on_its_way_is_named(
 ) -> None:
     for way in (tmp_path / "absolute", tmp_path / "shared" / ".." / "relative"):
         way.symlink_to(folder if way.name == "absolute" else "shared/keys")
-        assert find_folder_problem(way) == ""
+        assert find_folder_problem(way) is None
     folder.parent.chmod(0o777)
     for way in (tmp_path / "absolute", tmp_path / "relative"):
         assert f"run 'chmod go-w {folder.parent}'" in find_folder_problem(way)
@@ -54,8 +54,8 @@ def test_a_link_is_followed_and_whatever_others_may_replace_on_its_way_is_named(
 
 def test_a_loop_of_links_and_a_missing_folder_end_the_search(tmp_path: Path) -> None:
     (tmp_path / "loop").symlink_to("loop")
-    assert find_folder_problem(tmp_path / "loop" / "keys") == ""
-    assert find_folder_problem(tmp_path / "missing" / "keys") == ""
+    assert find_folder_problem(tmp_path / "loop" / "keys") is None
+    assert find_folder_problem(tmp_path / "missing" / "keys") is None
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root gives a folder to another user")
@@ -69,4 +69,4 @@ def test_what_belongs_to_another_user_is_named_unless_that_user_is_trusted(
     os.chown(other, 4711, -1, follow_symlinks=False)
     owned = rf"{other} belongs to another user \(id 4711\); .* run 'sudo chown -h 0 {other}'"
     assert re.fullmatch(owned, find_folder_problem(link))
-    assert find_folder_problem(link, 4711) == ""
+    assert find_folder_problem(link, 4711) is None

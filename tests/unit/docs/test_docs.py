@@ -17,7 +17,7 @@ from fishd.cli.doctor import checks
 from fishd.cli.doctor.base import Context
 from fishd.cli.main import fishctl
 from fishd.config import Config, keys, load
-from fishd.controllers.policy import checksum, file, library, operators
+from fishd.controllers.policy import file, library
 from fishd.controllers.policy.card import CARD_KEY, FORMAT, Card, Provenance
 from fishd.core.errors import UnknownController
 from fishd.core.schema import fields_of
@@ -207,7 +207,7 @@ def test_each_key_of_the_card_is_described() -> None:
 
 def test_names_of_files_ends_and_folders_are_right() -> None:
     text = text_of(DOCUMENT)
-    words = (CARD_KEY, checksum.CHECKSUM_KEY, file.INPUT, file.OUTPUT, library.SUFFIX)
+    words = (CARD_KEY, file.CHECKSUM_KEY, file.INPUT, file.OUTPUT, library.SUFFIX)
     for word in (*words, f"${library.FOLDERS_VARIABLE}"):
         assert f"`{word}`" in text or f"`{word} " in text or f"metadata `{word}`" in text
     assert f"more than {file.MAX_FILE_BYTES // 2**20} MB" in text
@@ -216,10 +216,10 @@ def test_names_of_files_ends_and_folders_are_right() -> None:
 
 def test_each_permitted_operator_is_listed() -> None:
     text = text_of(DOCUMENT)
-    for what, names in operators.PERMITTED.items():
+    for what, names in file.PERMITTED.items():
         assert f"| {what} | {', '.join(f'`{name}`' for name in sorted(names))} |" in text
-    assert f"versions {operators.OPSETS[0]} to {operators.OPSETS[-1]}:" in text
-    assert f"more than {operators.MAX_NODES} operators" in text
+    assert f"versions {file.OPSETS[0]} to {file.OPSETS[-1]}:" in text
+    assert f"more than {file.MAX_NODES} operators" in text
 
 
 def test_installing_lists_all_files_and_groups_that_come_onto_a_pi() -> None:

@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 
 from common.report import DOCS, between
-from fishd.lab.simulation import Report, free_swim
+from fishd.lab.simulation import Report
+from fishd.lab.swimmer import free_swim
 from paper import claims, figure_3, figure_4, figure_5, figure_6, swing_map
 from paper.runs import Run, read, swim
 

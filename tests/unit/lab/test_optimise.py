@@ -23,10 +23,10 @@ from fishd.lab.optimise.trials import (
     trial_durations,
     write_trial,
 )
-from fishd.lab.rerun import rerun
 from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import VirtualRun, simulate
 from fishd.recording import open_run, read
+from fishd.recording.rerun import rerun
 from fishd.virtual.plant.base import TrueWindow
 
 BEST = 25.736e-3

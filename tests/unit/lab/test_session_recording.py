@@ -10,10 +10,10 @@ from fishd.config import Config, load
 from fishd.core.errors import RecordingError
 from fishd.core.signals import Event, Tick
 from fishd.lab.identification import Unidentifiable, identify
-from fishd.lab.rerun import rerun
 from fishd.lab.run_traces import traces
 from fishd.lab.session import VirtualSession
 from fishd.recording import open_run
+from fishd.recording.rerun import rerun
 
 
 def test_every_swim_of_a_rig_is_rerun_to_the_last_bit(tmp_path: Path) -> None:

@@ -12,11 +12,12 @@ from rigs.processes import fishctl, one_line
 
 from fishd.config import Config
 from fishd.lab.experiment import Header, open_experiment
-from fishd.lab.sweep import figure, measuring
+from fishd.lab.sweep import figure
 from fishd.lab.sweep.curves import best_to_builtins, find_best, make_curves
 from fishd.lab.sweep.grid import Lengths, Point
-from fishd.lab.sweep.measuring import find_first_measured, is_steady, swim_freely
 from fishd.lab.sweep.results import SpeedResult, SweepFolder
+from fishd.lab.swimmer import speed
+from fishd.lab.swimmer.speed import find_first_measured, is_steady, swim_freely
 
 WAVE = Point("square", {"frequency": 3.0})
 
@@ -51,7 +52,7 @@ def test_a_speed_that_still_rises_is_not_steady_and_one_that_only_scatters_is() 
 def test_a_fish_whose_speed_still_changes_is_judged_by_the_later_half_and_that_is_said(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(measuring, "MAX_SWIM_S", 2.0)
+    monkeypatch.setattr(speed, "MAX_SWIM_S", 2.0)
     result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), None)
     assert result
     assert (result.failure, result.settled_time, result.seconds) == ("", None, 2.0)
@@ -64,8 +65,8 @@ def test_a_fish_whose_speed_still_changes_is_judged_by_the_later_half_and_that_i
 def test_a_fish_is_judged_as_soon_as_its_speed_is_steady(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fishd.lab.sweep.measuring.MIN_MEASURED_S", 0.5)
-    monkeypatch.setattr("fishd.lab.sweep.measuring.STEADY_FRACTION", 0.5)
+    monkeypatch.setattr("fishd.lab.swimmer.speed.MIN_MEASURED_S", 0.5)
+    monkeypatch.setattr("fishd.lab.swimmer.speed.STEADY_FRACTION", 0.5)
     result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), None)
     assert result
     assert result.settled_time is not None
@@ -100,8 +101,10 @@ def test_a_table_of_speeds_is_resumed_and_swing_is_drawn(tmp_path: Path, config:
     points = [Point("square", {"frequency": value}) for value in (1.0, 2.0, 3.0, 4.0, 5.0)]
     points += [Point("swing", {"C": value}) for value in (0.0, 0.6)]
     speeds = (0.02, 0.05, 0.07, 0.06, 0.03, 0.06, 0.07)
-    for point, speed in zip(points, speeds, strict=True):
-        result = SpeedResult(speed, speed_ci95=1e-3, beat_frequency=2.9, settled_time=4.0, beats=10)
+    for point, mean_speed in zip(points, speeds, strict=True):
+        result = SpeedResult(
+            mean_speed, speed_ci95=1e-3, beat_frequency=2.9, settled_time=4.0, beats=10
+        )
         folder.add_result(point, result, b"a recording")
     assert open_folder(tmp_path, config).results == folder.results
     curves = make_curves(folder, points)
@@ -130,7 +133,7 @@ def _no_worker_stays() -> Any:
 def test_a_sweep_of_swimmers_is_a_table_of_speeds_with_their_recordings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(measuring, "MAX_SWIM_S", 2.0)
+    monkeypatch.setattr(speed, "MAX_SWIM_S", 2.0)
     folder = tmp_path / "run"
     fast = ["--settle", "0.5", "--periods", "2", "--jobs", "1", "--folder", str(folder)]
     done = fishctl("sweep", "sine", "--frequency", "5", *OPTIONS, *fast)

@@ -2,8 +2,6 @@
 
 import os
 import shutil
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -12,19 +10,11 @@ from rigs.recordings import swum
 
 from fishd.core.errors import RecordingError
 from fishd.lab.experiment import Header, list_experiments, open_experiment
-from fishd.recording import RunWriter, open_run
+from fishd.recording import RunWriter
 from fishd.recording.black_box import BlackBox
 from fishd.recording.folder import find_recording, list_recordings, open_new
-from fishd.recording.numbering import COUNTER_FILE, read_number
+from fishd.recording.numbering import read_number
 
-HOLDER = """
-import fcntl, sys
-counter = open(sys.argv[1], "rb")
-fcntl.flock(counter, fcntl.LOCK_EX)
-print("locked", flush=True)
-sys.stdin.read()
-"""
-"""Program that holds the lock of a counter until its input ends, as if it were stopped."""
 YEAR_S = 365 * 86400.0
 
 
@@ -71,16 +61,6 @@ def test_a_black_box_removes_its_oldest_files_after_a_boot_with_a_wrong_clock(
     assert [read_number(path) for path in list_recordings(tmp_path)] == [3, 4, 5]
 
 
-def test_no_number_is_given_twice_even_if_the_newest_recordings_are_deleted(
-    tmp_path: Path,
-) -> None:
-    for name in ("a", "b", "c"):
-        record(tmp_path, name)
-    for name in ("b", "c"):
-        (tmp_path / f"{name}.mcap").unlink()
-    assert read_number(record(tmp_path, "d")) == 4
-
-
 def test_a_folder_from_another_machine_keeps_its_order_and_gets_larger_numbers(
     tmp_path: Path,
 ) -> None:
@@ -93,37 +73,6 @@ def test_a_folder_from_another_machine_keeps_its_order_and_gets_larger_numbers(
     record(here, "newest")
     assert read_number(here / "newest.mcap") == 4
     assert names(here) == ["a", "mine", "b", "c", "newest"]
-
-
-@pytest.mark.parametrize("damage", ["lost", "empty", "text", "folder"])
-def test_without_its_counter_the_numbers_of_the_recordings_decide(
-    tmp_path: Path, damage: str
-) -> None:
-    record(tmp_path, "a")
-    counter = tmp_path / COUNTER_FILE
-    counter.unlink()
-    if damage == "folder":
-        counter.mkdir()
-    elif damage != "lost":
-        counter.write_text("" if damage == "empty" else "twelve")
-    record(tmp_path, "b")
-    assert names(tmp_path) == ["a", "b"]
-    assert read_number(tmp_path / "b.mcap") == 2
-
-
-def test_without_the_lock_of_the_counter_the_numbers_of_the_recordings_decide(
-    tmp_path: Path,
-) -> None:
-    record(tmp_path, "a")
-    command = (sys.executable, "-c", HOLDER, str(tmp_path / COUNTER_FILE))
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
-        assert holder.stdout
-        assert holder.stdout.readline() == b"locked\n"
-        try:
-            record(tmp_path, "b")  # while the lock is held
-        finally:
-            holder.communicate()
-    assert read_number(tmp_path / "b.mcap") == 2
 
 
 def test_recordings_without_a_number_are_older_in_the_order_of_their_names(
@@ -141,15 +90,14 @@ def test_recordings_without_a_number_are_older_in_the_order_of_their_names(
     ]  # fmt: skip
 
 
-def test_recorders_that_begin_at_one_moment_get_names_and_numbers_of_their_own(
+def test_recorders_that_begin_at_one_moment_get_names_of_their_own(
     tmp_path: Path,
 ) -> None:
     with ThreadPoolExecutor(8) as pool:
         writers = list(pool.map(lambda _: open_new(tmp_path, RunWriter), range(24)))
     for writer in writers:
         writer.close()
-    numbers = [int(open_run(writer.path).about["number"]) for writer in writers]
-    assert sorted(numbers) == list(range(1, 25))
+    assert len({writer.path for writer in writers}) == len(list_recordings(tmp_path)) == 24
 
 
 def test_a_folder_that_cannot_be_written_is_refused_once(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from contextlib import suppress
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import ClassVar, Self
 from unittest.mock import MagicMock
 
 import msgspec
@@ -19,12 +18,12 @@ from rigs.recordings import record_run, status, swum, write
 
 from fishd.cli.recording.record import _print_summary
 from fishd.config import Config
-from fishd.core.errors import NoDaemon, RecordingError, Refused
+from fishd.core.errors import RecordingError
 from fishd.core.signals import Tick
 from fishd.recording import Gap, RunWriter, open_run, read
 from fishd.recording import recorder as recorder_module
 from fishd.recording.folder import find_recording, list_recordings, read_overview, read_overviews
-from fishd.recording.recorder import TAKEOVER_MESSAGE, Description, NewFrames, Recorder
+from fishd.recording.recorder import TAKEOVER_MESSAGE, Description, Recorder
 from fishd.recording.recover import recover
 from fishd.recording.summary import Tally
 
@@ -304,41 +303,6 @@ def test_ticks_that_arrive_after_the_last_status_are_no_sign_of_another_fishd(
     recorder.__exit__(None, None, None)
     assert recorder.is_complete == complete
     assert len(open_run(tmp_path / "run.mcap").ticks) == 5
-
-
-def test_what_fishd_could_not_be_told_of_the_camera_it_is_told_later(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    reached: list[Exception | None] = [NoDaemon(), None, Refused("full", ""), None, None]
-    marks: list[str] = []
-
-    class Fishd:
-        def __init__(self, *_: object, **__: object) -> None:
-            pass
-
-        def __enter__(self) -> Self:
-            return self
-
-        def __exit__(self, *_: object) -> None:
-            pass
-
-        def mark(self, line: str) -> None:
-            if error := reached.pop(0):
-                raise error
-            marks.append(line)
-
-    class Camera:
-        news: ClassVar = [["it is gone"], [], ["it is back", "and again"], ["and well"]]
-
-        def take(self) -> NewFrames:
-            return NewFrames(self.news.pop(0), [])
-
-    monkeypatch.setattr(recorder_module, "Fish", Fishd)
-    recorder = Recorder(None, partial(RunWriter, tmp_path / "run"), tell=lambda line: None)
-    for _ in range(4):
-        recorder._take_frames(Camera())
-    recorder._close()
-    assert marks == ["it is gone", "and again", "and well"]
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from reliability.systemd.root import (
     check_machine,
     make_debian,
 )
-from reliability.systemd.trials import CONFIG, TRIALS, Rig, Row
+from reliability.systemd.trials import CONFIG, TRIALS, Rig
 
 __all__ = ["OPTIONS", "measure"]
 HERE = Path(__file__).resolve().parent
@@ -54,10 +54,11 @@ def _try_all(container: Container) -> Report:
             rig.swim()
             rows.append(trial(rig))
             progress(rows[-1].what, rows[-1].outcome)
-    text = _text(container, rows, limits)
+    cells = ((r.what, *("" if t is None else f"{t:.2f}" for t in r[1:4]), r.outcome) for r in rows)
+    head = "action | servo neutral [s] | pulses off [s] | ready (again) [s] | outcome"
     offs = [row.off for row in rows if row.off is not None]
     number = f"{len(rows)} actions as promised; pulses off after at most {max(offs):.2f} s"
-    return Report({"reliability systemd": text}, rows, number=number)
+    return Report({"reliability systemd": table(head, cells)}, rows, number=number)
 
 
 def _configure(container: Container, limits: bool) -> None:
@@ -113,23 +114,3 @@ def work_folder(keep: bool) -> Iterator[Path]:
             progress(f"kept: {folder}")
         else:
             shutil.rmtree(folder)
-
-
-def _text(container: Container, rows: list[Row], limits: bool) -> str:
-    version = container.run("systemctl", "--version").split()[1]
-    python = container.run("python3", "--version")
-    cells = (
-        (row.what, *("" if t is None else f"{t:.2f}" for t in row[1:4]), row.outcome)
-        for row in rows
-    )
-    text = (
-        f"systemd {version}, {python}, fishd from its Debian package with "
-        "the virtual Pi; times in seconds from the action.\n\n"
-        + table("action | servo neutral | pulses off | ready (again) | outcome", cells)
-    )
-    if not limits:
-        text += (
-            f"\n\nThis machine forbids systemd to raise limits; {_MAY} replaced `LimitRTPRIO=` "
-            "and `LimitMEMLOCK=`. The unit is otherwise as installed."
-        )
-    return text

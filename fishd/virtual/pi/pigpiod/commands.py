@@ -1,6 +1,6 @@
 """Commands of the emulated pigpiod, without its sockets, on the GPIOs of a Pi 4 and on scripts.
 
-They are those of fishd, and those that move a servo with `pigs`. All others are answered with −88,
+They are those of fishd, and of other programs that move a servo. All others are answered with −88,
 unknown command, and logged.
 """
 
@@ -268,7 +268,6 @@ class Commands:
             "PROCR": lambda time, script, _, extension: self._script(script).start(
                 time, _parameters(extension)
             ),
-            "PROCS": lambda time, script, _, __: self._script(script).stop(),
             "PROCU": lambda time, script, _, extension: self._script(script).update(
                 _parameters(extension)
             ),

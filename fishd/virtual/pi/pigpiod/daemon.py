@@ -1,4 +1,4 @@
-"""Emulated pigpiod: a TCP server for the real pigpio client and `pigs`, which run unchanged.
+"""Emulated pigpiod: a TCP server for the real pigpio client, which runs unchanged.
 
 The emulated tank reads the pulses of a pin from it. Scripts and frames are evaluated lazily: they
 advance to the current time at each request of a client or the tank.
@@ -15,16 +15,14 @@ import time
 
 from fishd.core.clock import Clock
 from fishd.virtual.pi.faults import Faults
-from fishd.virtual.pi.pigpiod import errors
 from fishd.virtual.pi.pigpiod.commands import NAMES, UNKNOWN_TO_OLD, Commands
-from fishd.virtual.pi.pigpiod.script import MAX_DELAY_MS
 from fishd.virtual.pi.pulse_train import Edge
 
 POLL_PERIOD_S = 5e-3
-"""Time between two checks of the clock while a delay or a fault is active [s]."""
+"""Time between two checks of the clock while a fault or a notification is active [s]."""
 MAX_EXTENSION_BYTES = 65_535
 """Largest extension of a command; pigpiod drops a client that announces more [bytes]."""
-_MILS, _OPEN_NOTIFICATION = NAMES.index("MILS"), NAMES.index("NOIB")
+_OPEN_NOTIFICATION = NAMES.index("NOIB")
 _HEADER = struct.Struct("<4I")
 """Header of a command: number, p1, p2, length of the extension; in a reply, the result is last."""
 
@@ -38,11 +36,8 @@ class Connection:
         self.socket = client
         self._commands = commands
         self._input = bytearray()
-        self._late_reply = b""
         self.notification: int | None = None
         """Handle of the notifications that this connection receives."""
-        self.due = math.inf
-        """End of a delay that the client has requested [s]."""
 
     def receive(self, time: float) -> bool:
         """Read and execute commands at a time [s]; return False if the client has disconnected."""
@@ -54,12 +49,6 @@ class Connection:
             return False
         self._input += data
         return bool(data) and self._execute_input(time)
-
-    def end_delay(self, time: float) -> bool:
-        """Answer a finished delay and continue; return False if the client must be dropped."""
-        self.due = math.inf
-        self._send(self._late_reply)
-        return self._execute_input(time)
 
     def hang_up(self) -> None:
         """Shut down the connection; the server then detects that it is closed."""
@@ -76,7 +65,7 @@ class Connection:
         self.hang_up()
 
     def _execute_input(self, time: float) -> bool:
-        while self.due == math.inf and len(self._input) >= _HEADER.size:
+        while len(self._input) >= _HEADER.size:
             number, p1, p2, length = _HEADER.unpack_from(self._input)
             if length > MAX_EXTENSION_BYTES:
                 return False
@@ -86,22 +75,15 @@ class Connection:
             extension = bytes(self._input[_HEADER.size : end])
             del self._input[:end]
             self._answer(time, number, p1, p2, extension)
-        # Drop a client that keeps sending while it should wait for its reply.
-        return len(self._input) <= _HEADER.size + MAX_EXTENSION_BYTES
+        return True
 
     def _answer(self, time: float, number: int, p1: int, p2: int, extension: bytes) -> None:
         extra_bytes = b""
         if number == _OPEN_NOTIFICATION:
             result = self.notification = self._commands.open_notification(self._send)
-        elif number != _MILS:
+        else:
             result, extra_bytes = self._commands.execute(time, number, p1, p2, extension)
-        else:
-            result = 0 if p1 <= MAX_DELAY_MS else errors.BAD_MILS_DELAY
-        reply = _HEADER.pack(number, p1, p2, result & 0xFFFFFFFF) + extra_bytes
-        if number == _MILS and p1 and result == 0:
-            self.due, self._late_reply = time + p1 * 1e-3, reply
-        else:
-            self._send(reply)
+        self._send(_HEADER.pack(number, p1, p2, result & 0xFFFFFFFF) + extra_bytes)
 
 
 class Pigpiod:
@@ -231,9 +213,6 @@ class Pigpiod:
         if not frozen:
             self._commands.advance(now)
             self._commands.notify(now, not faults.none and faults.active("pulse-jitter"))
-            for connection in list(self._connections.values()):
-                if connection.due <= now and not connection.end_delay(now):
-                    self._drop(connection)
         return now
 
     def _serve(self) -> None:
@@ -247,19 +226,15 @@ class Pigpiod:
                 if not self._frozen:
                     for descriptor, _ in events:
                         self._handle_event(descriptor, now)
-                timeout = self._poll_timeout(now)
+                timeout = self._poll_timeout()
             if self._frozen:
                 # Data from clients stays in the kernel, as with a stopped process.
                 time.sleep(POLL_PERIOD_S)
 
-    def _poll_timeout(self, now: float) -> float | None:
-        if self._gone or self._frozen:
-            return POLL_PERIOD_S
-        due = min((connection.due for connection in self._connections.values()), default=math.inf)
-        if self._commands.notifications:
-            return POLL_PERIOD_S
-        # Polled, because a virtual clock may advance at any speed.
-        return None if due == math.inf else min(POLL_PERIOD_S, max(0.0, due - now))
+    def _poll_timeout(self) -> float | None:
+        """Return the longest wait for clients [s]; None where they alone make a difference."""
+        is_polled = self._gone or self._frozen or self._commands.notifications
+        return POLL_PERIOD_S if is_polled else None
 
     def _handle_event(self, descriptor: int, now: float) -> None:
         connection = self._connections.get(descriptor)

@@ -23,7 +23,7 @@ INSTRUCTION_TIME = 1e-6
 INITIALISING_TIME = 1e-3
 """Time from the storage of a script until it can run [s]."""
 MAX_DELAY_MS = 60_000
-"""Longest delay of the command and the instruction `mils` [ms]."""
+"""Longest delay of the instruction `mils` [ms]."""
 MAX_BURST = 5000
 """Largest number of instructions without a delay; then a script skips the remaining time."""
 
@@ -109,7 +109,6 @@ class Script:
         self._program = parse(text)
         self._servo = servo
         self._ready = time + INITIALISING_TIME
-        self._is_requested = False
         self._accumulator = self._flag = self._position = self._burst = 0
         self.parameters = [0] * PARAMETER_COUNT
         self.time = math.inf
@@ -134,15 +133,9 @@ class Script:
         state = self.state(time)
         check(state is not State.INITIALISING, errors.SCRIPT_NOT_READY)
         self.update(parameters)
-        self._is_requested = True
         if state is State.HALTED:
             self._accumulator = self._flag = self._position = self._burst = 0
             self.time = time
-        return 0
-
-    def stop(self) -> int:
-        """Request a halt, which takes effect at the end of a delay."""
-        self._is_requested = False
         return 0
 
     def run(self, until: float) -> None:
@@ -151,7 +144,7 @@ class Script:
             if self._burst >= MAX_BURST:
                 self._burst = 0
                 self.time = math.nextafter(until, math.inf)
-            elif self._is_requested and self._position < len(self._program):
+            elif self._position < len(self._program):
                 self._step()
             else:
                 self.time = math.inf

@@ -8,7 +8,6 @@ import pigpio
 import pytest
 from rigs.pigpiod_client import GPIO, Bench, dispose, eventually, pigpiod_bench
 
-from fishd.virtual.pi.pigpiod.commands import NAMES
 from fishd.virtual.pi.pigpiod.daemon import Pigpiod
 
 
@@ -112,13 +111,7 @@ def test_commands_may_arrive_in_any_pieces(bench: Bench) -> None:
     assert struct.unpack("<8I", replies) == (8, GPIO, 1500, 0, 86, GPIO, 50, 0)
 
 
-WITHOUT_WAITING = struct.pack("<4I", NAMES.index("MILS"), 60_000, 0, 0) + bytes(65_552)
-"""A delay of a minute, and more than a whole command that does not wait for its answer."""
-
-
-@pytest.mark.parametrize(
-    "garbage", [b"\xff" * 16, b"GET / HTTP/1.1\r\n\r\n", WITHOUT_WAITING], ids=len
-)
+@pytest.mark.parametrize("garbage", [b"\xff" * 16, b"GET / HTTP/1.1\r\n\r\n"], ids=len)
 def test_garbage_costs_its_sender_the_link_and_nobody_else(bench: Bench, garbage: bytes) -> None:
     with socket.create_connection(("127.0.0.1", bench.daemon.port), timeout=60) as link:
         link.sendall(garbage)

@@ -17,7 +17,7 @@ import pytest
 from rigs.coarse_swimmer import OPTIONS, coarse
 from rigs.processes import FISHCTL, PATIENCE, fishctl, one_line, sets
 
-from fishd.lab.simulation.free_swim import swim
+from fishd.lab.swimmer.free_swim import swim
 from fishd.virtual.swimmer import checkpoint
 from fishd.virtual.swimmer.track import COLUMNS
 

@@ -21,7 +21,7 @@ from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.controllers.policy import file, library
 from fishd.controllers.policy.card import CARD_KEY, encode
-from fishd.controllers.policy.checksum import SEAL_REMEDY, seal
+from fishd.controllers.policy.file import SEAL_REMEDY, seal
 from fishd.controllers.policy.network import Sight, to_onnx
 from fishd.controllers.policy.runtime import Network
 from fishd.core.camera_frames import StackSettings

@@ -12,7 +12,7 @@ from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.controllers.policy.card import Card, Feature, FeatureName, History, Window
 from fishd.controllers.policy.network import to_onnx
-from fishd.controllers.policy.pilot import Pilot
+from fishd.controllers.policy.runtime import Pilot
 from fishd.core.signals import Observation
 
 FREE = Limits(LIMITS.amplitude, LIMITS.tick, dwell=0.0)

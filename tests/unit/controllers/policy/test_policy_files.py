@@ -20,7 +20,7 @@ from rigs.policy_files import FLIP, card, random_layers, refusal, write
 
 from fishd.controllers.policy import file
 from fishd.controllers.policy.card import CARD_KEY, encode
-from fishd.controllers.policy.checksum import SEAL_REMEDY, seal
+from fishd.controllers.policy.file import SEAL_REMEDY, seal
 from fishd.controllers.policy.network import to_onnx
 from fishd.controllers.policy.runtime import Network
 from fishd.core.errors import PolicyError
@@ -246,7 +246,7 @@ def test_a_file_of_another_tool_is_refused_with_its_ends_and_the_way_to_a_policy
         "float32 of shape [1] named 'out0'. Write a model of stable-baselines3 with "
         "fishd.learning.export.export_model; for any other, name the input 'observation' and the "
         "output 'action', float32 of shapes [1, N] and [1, 1], add the card, and call "
-        "fishd.controllers.policy.checksum.seal as the last step"
+        "fishd.controllers.policy.file.seal as the last step"
     )
 
 

@@ -13,8 +13,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from rigs.policy_files import card, of_nodes, random_layers, refusal, write
 
-from fishd.controllers.policy import file, operators
-from fishd.controllers.policy.checksum import SEAL_REMEDY, seal
+from fishd.controllers.policy import file
+from fishd.controllers.policy.file import SEAL_REMEDY, seal
 from fishd.controllers.policy.network import to_onnx
 from fishd.controllers.policy.runtime import Network
 from fishd.core.errors import PolicyError
@@ -96,7 +96,7 @@ def test_more_operators_than_a_policy_needs_are_refused() -> None:
         names = ["observation", *(f"v{number}" for number in range(count - 1)), "action"]
         return of_nodes([make("Tanh", [a], [b]) for a, b in pairwise(names)])
 
-    operators.check(onnx.load_model_from_string(chain(1000)))
+    file.check_operators(onnx.load_model_from_string(chain(1000)))
     assert refusal(chain(1001)) == "it has 1001 operators; 1000 are the most"
 
 
@@ -134,7 +134,7 @@ def test_a_newer_format_than_onnx_reads_is_refused_with_the_one_to_set() -> None
     model.ir_version = 99
     assert refusal(seal(model)) == (
         f"its ir_version is 99; the installed onnx reads up to {onnx.IR_VERSION}: set "
-        f"model.ir_version to {operators.IR_VERSION}, and {SEAL_REMEDY}"
+        f"model.ir_version to {file.IR_VERSION}, and {SEAL_REMEDY}"
     )
 
 
@@ -184,7 +184,7 @@ def test_a_usual_network_is_fast_enough_for_the_shortest_tick(tmp_path: Path) ->
     Network(file.read(write(tmp_path, to_onnx(layers, "tanh", wide))))
 
 
-@pytest.mark.parametrize("opset", [operators.OPSETS[0], 21])
+@pytest.mark.parametrize("opset", [file.OPSETS[0], 21])
 def test_what_other_exporters_write_is_permitted(tmp_path: Path, opset: int) -> None:
     """Layers as MatMul and Add, constants in nodes, scaling in the network, squashed Gaussians."""
     half = numpy_helper.from_array(np.array(0.5, np.float32))
@@ -209,6 +209,6 @@ def test_what_other_exporters_write_is_permitted(tmp_path: Path, opset: int) -> 
 
 
 def test_every_permitted_operator_is_one_of_onnx() -> None:
-    latest = operators.OPSETS[-1]
-    for names in operators.PERMITTED.values():
+    latest = file.OPSETS[-1]
+    for names in file.PERMITTED.values():
         assert [name for name in names if not onnx.defs.has(name, latest, "")] == []

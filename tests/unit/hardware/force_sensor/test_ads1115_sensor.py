@@ -17,7 +17,7 @@ def test_forces_are_the_calibrated_voltages(rig: ForceRig) -> None:
     measured = Ticks(rig.sensor(CALIBRATION)).next()
     assert measured.fx == pytest.approx(2.0 * 0.5 + 0.1 * -0.25 - 0.3, abs=2e-4)
     assert measured.fy == pytest.approx(-0.2 * 0.5 + 3.0 * -0.25 + 0.4, abs=3e-4)
-    assert measured.suspect == ""
+    assert measured.suspect is None
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_a_watch_adds_up_the_voltages_of_its_time(rig: ForceRig) -> None:
     assert (sample.vx, sample.vy) == pytest.approx((0.6, -0.25), abs=1e-5)
     assert (sample.fx, sample.fy) == pytest.approx(CALIBRATION.forces(0.6, -0.25), abs=1e-4)
     assert sample.vx_std == pytest.approx(STEP, rel=0.3)
-    assert sample.suspect == ""
+    assert sample.suspect is None
 
 
 def test_a_watch_remembers_that_samples_were_suspect(rig: ForceRig) -> None:

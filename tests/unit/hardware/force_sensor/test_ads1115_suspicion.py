@@ -58,8 +58,8 @@ def test_an_amplifier_with_one_output_ends_at_0(rig: ForceRig, low: float, suspe
     rig.volts = {"A0": 0.02, "A1": 1.65}
     sensor = rig.sensor(channel_x="A0", channel_y="A1", full_scale=4.096, saturation_low=low)
     suspect = Ticks(sensor).next().suspect
-    assert suspect.startswith("F_x (channel A0) is at +0.0") == suspected
-    assert bool(suspect) == suspected
+    assert (suspect is not None) == suspected
+    assert not suspect or suspect.startswith("F_x (channel A0) is at +0.0")
 
 
 def test_where_the_amplifier_has_another_supply_the_whole_range_is_believed(rig: ForceRig) -> None:

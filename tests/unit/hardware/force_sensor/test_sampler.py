@@ -143,7 +143,7 @@ def test_each_measurement_is_right_none_is_of_the_future_and_it_recovers(
             assert newest <= item.time <= index * ticks.tick
             newest = item.time
             assert (item.fx, item.fy) == pytest.approx((0.5, -0.25), abs=6 * STEP)
-            assert item.suspect == ""
+            assert item.suspect is None
 
 
 @given(windows, calibrations)
@@ -160,7 +160,7 @@ def test_the_force_of_a_window_is_the_mean_of_the_forces_of_its_pairs(
         weighted = sum(w * force for w, force in zip(weights, values, strict=True))
         assert mean == pytest.approx(weighted / sum(weights), abs=1e-9)
     assert measured.samples == len(window)
-    assert measured.suspect == ""
+    assert measured.suspect is None
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 13, 14])
@@ -208,7 +208,7 @@ def test_a_window_is_suspect_exactly_if_a_force_is_beyond_the_limit(
 def test_a_watch_finds_mean_and_deviation_of_all_pairs(parts: list[list[tuple[int, int]]]) -> None:
     watch = VoltageWatch(0.0, ForceCalibration())
     for part in parts:
-        watch.add(as_pairs(part), "")
+        watch.add(as_pairs(part), None)
     sample = watch.close()
     xs = [x * STEP for part in parts for x, _ in part]
     assert sample.pairs == len(xs)

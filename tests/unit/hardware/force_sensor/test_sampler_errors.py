@@ -36,7 +36,7 @@ def test_a_reset_amid_a_conversion_gives_an_error_and_no_value(rig: ForceRig, de
     assert sampler.trouble == "the ADS1115 was reset while it converted: check its power"
     rig.clock.sleep = sleep
     pairs = take_pairs(sampler, rig, 0.5)
-    assert sampler.trouble == ""
+    assert sampler.trouble is None
     assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
     assert len(pairs) > 15
 
@@ -117,7 +117,7 @@ def test_the_trouble_is_one_line_that_says_what_to_check(
     assert sampler.trouble.startswith(line)
     rig.faults.clear()
     assert take_pairs(sampler, rig, 1.0)
-    assert sampler.trouble == ""
+    assert sampler.trouble is None
 
 
 def test_a_bus_that_is_missing_is_named_and_used_once_it_is_there() -> None:

@@ -12,6 +12,8 @@ from fishd.core.errors import ConfigError, FishLost, StartupError
 from fishd.lab.simulation.virtual_run import KeepingPublisher, VirtualRun
 from fishd.virtual.plant.registry import open_plant
 
+pytestmark = pytest.mark.slow
+
 CODE = """
 from typing import Annotated
 from msgspec import Struct

@@ -114,8 +114,8 @@ def test_the_loop_swims_it_and_latches_a_fault_of_its_own_where_it_is_lost() -> 
         run.set_controller("swing", {})
         for _ in range(30):
             run.tick()
-        assert run.swimmer
-        run.swimmer.fish.step = diverges  # type: ignore[method-assign]
+        assert run.fish
+        run.fish.fish.step = diverges  # type: ignore[method-assign]
         run.tick()
         supervisor = run.loop.supervisor
         assert supervisor.mode.value == "fault"
@@ -124,8 +124,8 @@ def test_the_loop_swims_it_and_latches_a_fault_of_its_own_where_it_is_lost() -> 
     tick = publisher.ticks[29]
     assert tick.mode == "running"
     assert tick.fin_velocity == pytest.approx(tick.alpha_rate, rel=0.5)
-    assert tick.speed == run.swimmer.motion.speed
-    assert tick.x == run.swimmer.motion.x
+    assert tick.speed == run.fish.motion.speed
+    assert tick.x == run.fish.motion.x
 
 
 def test_nothing_judges_a_swimmer_as_if_it_were_tethered() -> None:

@@ -21,7 +21,7 @@ from fishd.core.process.interruption import on_signal
 
 if TYPE_CHECKING:
     from fishd.config import Config
-    from fishd.lab.simulation.free_swim import SwimReport, SwimResult
+    from fishd.lab.swimmer.free_swim import SwimReport, SwimResult
     from fishd.virtual.swimmer.robot import Swimmer
 
 DEFAULT_CHECKPOINT_INTERVAL_S = 5.0
@@ -35,7 +35,7 @@ _RUN_ONLY_OPTIONS = RUN_ONLY_OPTIONS | dict.fromkeys(
 """Options that a resumed swim does not take over, and the number of words after each."""
 
 
-class SwimmerOptions(NamedTuple):
+class FreeSwimOptions(NamedTuple):
     """Values of the options that only a free swimmer has."""
 
     target: Path | None
@@ -80,7 +80,7 @@ def _check_writable(path: Path) -> None:
         raise ParameterError(f"{path}: {problem}") from None
 
 
-def swimmer_options(function: F) -> F:
+def free_swim_options(function: F) -> F:
     """Add `--to`, `--checkpoint-every`, `--resume` and `--film`."""
 
     def file_option(*names: str, about: str) -> Callable[[F], F]:
@@ -134,14 +134,14 @@ def _read_command(_: click.Context, path: Path) -> list[str]:
     return [*checkpoint.load(path).command, "--to", str(path)]
 
 
-def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
+def swim(arguments: tuple[Any, ...], options: FreeSwimOptions, as_json: bool) -> int:
     """Swim, and print the report; return the exit status.
 
     arguments: configuration, controller, parameters, seconds, settle time, publisher, begun
     Raises `FishdError` and OSError.
     """
-    from fishd.lab.simulation.free_swim import SwimFile
-    from fishd.lab.simulation.free_swim import swim as run
+    from fishd.lab.swimmer.free_swim import SwimFile
+    from fishd.lab.swimmer.free_swim import swim as run
     from fishd.virtual.swimmer import checkpoint, track
 
     target = options.target
@@ -200,7 +200,7 @@ def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> 
 
 
 @contextmanager
-def _open_film(config: "Config", options: SwimmerOptions) -> "Iterator[Callable[[Swimmer], None]]":
+def _open_film(config: "Config", options: FreeSwimOptions) -> "Iterator[Callable[[Swimmer], None]]":
     """Yield a function that paints the fish if there is a film; the film is written at the end."""
     if options.film is None:
         yield lambda fish: None
@@ -211,7 +211,7 @@ def _open_film(config: "Config", options: SwimmerOptions) -> "Iterator[Callable[
         yield lambda fish: film.add_frame(fish.fish)
 
 
-def _describe_checkpoint(outcome: "SwimResult", options: SwimmerOptions) -> str:
+def _describe_checkpoint(outcome: "SwimResult", options: FreeSwimOptions) -> str:
     """Return a clause about the file from which the swim can be resumed."""
     if outcome.checkpoint_time is not None:
         return (

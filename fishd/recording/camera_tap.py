@@ -7,13 +7,14 @@ from fishd.camera.client import CameraClient
 from fishd.camera.messages import FrameHeader
 from fishd.client import Fish
 from fishd.core import text
-from fishd.core.camera_frames import Frame
+from fishd.core.camera_frames import Frame, Pixels
 from fishd.core.errors import FishError
 from fishd.recording.images import FrameHead
-from fishd.recording.recorder import POLL_INTERVAL_S, NewFrames
 
 CAMERA_TIMEOUT_S = 2.0
 """Time without a frame after which the camera counts as lost [s]."""
+POLL_INTERVAL_S = 0.02
+"""Interval at which the last frames of a recording are awaited [s]."""
 LAST_FRAMES_TIMEOUT_S = 1.0
 """Longest wait for the last frames of a recording [s]."""
 _MAX_WAITING_FRAMES = 1000
@@ -61,8 +62,11 @@ class CameraTap:
         if monotonic:
             self._ahead = t - monotonic
 
-    def take(self) -> NewFrames:
-        """Return the news and frames since the previous call; raise no error of the camera."""
+    def take(self) -> tuple[list[str], list[tuple[FrameHead, Pixels]]]:
+        """Return the news and frames since the previous call; raise no error of the camera.
+
+        The news have one line for the user per change of the camera's state.
+        """
         news: list[str] = []
         while frames := self._poll():
             self._waiting += frames
@@ -77,9 +81,9 @@ class CameraTap:
             news.append(f"no frames come from the camera: {self._why()}; the recording continues")
         if self._ahead is None:
             self._waiting = self._waiting[-_MAX_WAITING_FRAMES:]
-            return NewFrames(news, [])
+            return news, []
         waiting, self._waiting = self._waiting, []
-        return NewFrames(news, [(self._head(*pair), pair[1].pixels) for pair in waiting])
+        return news, [(self._head(*pair), pair[1].pixels) for pair in waiting]
 
     def count_missing(self) -> int | None:
         """Return how many published frames have not arrived; None if the camera does not say.

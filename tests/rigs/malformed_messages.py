@@ -1,37 +1,16 @@
-"""Malformed HTTP requests and WebSocket messages against a real `fishd-window`, on loopback.
-
-The window must go on answering, in bounded memory, and the fish must stay at rest.
-"""
+"""Malformed HTTP requests and WebSocket messages to a window."""
 
 import asyncio
-import os
 import random
 import struct
-import sys
-import tempfile
-import time
-from argparse import Namespace
 from collections.abc import Callable
 from contextlib import suppress
 from http.client import HTTPConnection
-from pathlib import Path
 
-from msgspec import Struct
-
-from common.daemon import TIMEOUT_S, Fishd
-from common.processes import Process
-from common.report import Options, Report, progress, table
-
-MAX_MEGABYTES = 120.0
-"""Largest resident memory of the window [MB]: a dozen pages at once that do not read their history
-of two minutes, which takes 0.7 MB and is copied on its way."""
 ANSWER_TIMEOUT_S = 10.0
 LANES = 8
 """Number of attackers at a time."""
-BATCH = 1000
-"""Number of malformed messages between two checks."""
 FRAMES_PER_CONNECTION = 20
-START = "from fishd.__main__ import fishd_window; fishd_window()"
 PATHS = (
     "/", "/live", "/foxglove", "/api/session", "/api/pair", "/api/unpair", "/api/fish", "/api/jobs",
     "/api/runs", "/api/fish/fish/drive", "/api/fish/fish/request",
@@ -197,102 +176,3 @@ def answers(port: int) -> bool:
         return False
     finally:
         connection.close()
-
-
-def memory(pid: int) -> float:
-    """Return the resident memory of a process [MB]."""
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-class Window(Process):
-    """A `fishd-window` of one fish; a context manager."""
-
-    def __init__(
-        self, endpoint: str, folder: str, listen: str = "127.0.0.1:0", config: str = ""
-    ) -> None:
-        """config: configuration of fishd, by which fishctl finds the servo without it"""
-        options = ("--listen", listen, "--state", folder, "--fish", f"fish={endpoint}")
-        environment = {**os.environ, "FISHD_CONFIG": config}
-        super().__init__(sys.executable, "-P", "-c", START, *options, env=environment)
-        assert self.process.stderr
-        line = self.process.stderr.readline()
-        self.port = int(line.rstrip().rstrip("/").rpartition(":")[2])
-
-
-class Outcome(Struct):
-    """Result of one kind of attack."""
-
-    what: str
-    messages: int
-    left_open: int
-    """Number of connections that the window did not close."""
-    mistakes: int
-    """Number of answers with status 500."""
-    answers: bool
-    """Whether it answered a page after each batch."""
-    megabytes: float
-    """Largest resident memory after a batch."""
-    seconds: float
-
-
-OPTIONS: Options = {
-    "--number": {"type": int, "default": 100_000, "help": "of messages; default 100000"},
-    "--seed": {"type": int, "default": 1},
-}
-
-
-def measure(options: Namespace) -> Report:
-    """Attack one window with each kind in turn; some minutes."""
-    outcomes = []
-    share = options.number // len(ATTACKS)
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        Fishd("start.controller=hold") as fishd,
-        Window(fishd.endpoint, folder) as window,
-    ):
-        fishd.next_tick(TIMEOUT_S)
-        before = fishd.status()
-        for what, (attacker, size) in ATTACKS.items():
-            outcome = Outcome(what, 0, 0, 0, True, 0.0, 0.0)
-            start = time.monotonic()
-            while outcome.messages < share:
-                connections = max(1, min(BATCH, share - outcome.messages) // size)
-                seed = options.seed + outcome.messages
-                open_, mistakes = asyncio.run(attack(attacker, connections, seed, window.port))
-                outcome.left_open += open_
-                outcome.mistakes += len(mistakes)
-                if mistakes:
-                    progress(*mistakes[:3])
-                outcome.messages += connections * size
-                outcome.answers = outcome.answers and answers(window.port)
-                outcome.megabytes = max(outcome.megabytes, memory(window.pid))
-            outcome.seconds = time.monotonic() - start
-            outcomes.append(outcome)
-            progress(what, f"{outcome.seconds:.0f} s", f"{outcome.megabytes:.0f} MB")
-        after = fishd.status()
-    unchanged = (before.mode, before.controller) == (after.mode, after.controller)
-    rows = [
-        [
-            o.what,
-            str(o.messages),
-            str(o.left_open),
-            str(o.mistakes),
-            "yes" if o.answers else "NO",
-            f"{o.megabytes:.0f}",
-        ]
-        for o in outcomes
-    ]
-    head = "malformed | messages | left open | status 500 | goes on answering | memory [MB]"
-    fish = "as it was" if unchanged else "CHANGED"
-    broken = not unchanged or any(
-        o.left_open or o.mistakes or not o.answers or o.megabytes > MAX_MEGABYTES for o in outcomes
-    )
-    text = f"{table(head, rows)}\n\nThe fish was {fish}. Seed {options.seed}."
-    number = (
-        f"{sum(o.mistakes for o in outcomes)} errors of status 500 in "
-        f"{sum(o.messages for o in outcomes)} messages, {sum(o.left_open for o in outcomes)} "
-        f"connections left open; at most {max(o.megabytes for o in outcomes):.0f} MB; the fish was "
-        f"{fish}"
-    )
-    return Report({"reliability window": text}, outcomes, broken=broken, number=number)

@@ -18,11 +18,10 @@ from functools import lru_cache, partial
 from typing import Annotated
 
 import numpy as np
-from msgspec.structs import replace
+from msgspec.structs import asdict
 from scipy.linalg import expm
 
 from fishd.config import Config
-from fishd.lab.simulation import simulate
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.base import REST, Plant, PlantParameters, PlantState, PlantWindow, unit
 from fishd.virtual.plant.registry import PLANTS
@@ -33,8 +32,13 @@ STEP_S = 0.001
 WHEEL_STEPS = 8
 """Number of steps of the wheel in one of the fin."""
 MODEL = "foreign"
-HALF_BEATS = range(2, 26)
-"""Half beats of the square waves among which the best one is [ticks]."""
+VARIED = "omega0", "xi", "coupling", "servo_speed", "thrust_coefficient", "lateral_drag"
+"""Parameters up to 30 % from those of the default fish."""
+FOREIGN_KINDS = (
+    *LAWS, "backlash", "dead zone", "delay", "asymmetry", "backlash and dead zone", "all of these",
+    "quadratic drag", "K_y/K from 0.25 to 0.5", "K_y/K from 2 to 4", "all, K_y/K from 2 to 4",
+)  # fmt: skip
+"""Kinds of foreign fish, in turn; those that are not named after a law have each in turn."""
 
 
 class ForeignParameters(PlantParameters, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -183,24 +187,35 @@ def register() -> None:
 
 
 def foreign_fish(seed: int) -> Config:
-    """Return a fish drawn by a seed, with a law of the servo in turn, and its rig."""
+    """Return a fish of one of `FOREIGN_KINDS`, and its rig."""
     register()
+    turn, place = divmod(seed % 1000, len(FOREIGN_KINDS))
+    kind = FOREIGN_KINDS[place]
     chance = random.Random(seed)
-    plain = PlantParameters()
-    varied = {
-        name: getattr(plain, name) * chance.uniform(0.7, 1.3)
-        for name in ("omega0", "xi", "coupling", "servo_speed", "thrust_coefficient")
+    plain = asdict(PlantParameters())
+    has_all = kind.startswith("all")
+    ratio = chance.uniform(2.0, 4.0)
+    varied = {name: plain[name] * chance.uniform(0.7, 1.3) for name in VARIED}
+    imperfections = {
+        "servo_asymmetry": (
+            "asymmetry" in kind,
+            chance.choice((-1, 1)) * chance.uniform(0.05, 0.2),
+        ),
+        "servo_dead_zone": ("dead zone" in kind, chance.uniform(0.01, 0.03)),
+        "backlash": ("backlash" in kind, chance.uniform(0.01, 0.05)),
+        "servo_delay": (kind == "delay", chance.uniform(0.005, 0.03)),
     }
+    drag = chance.uniform(0.5, 2.0)
+    ratios = {"K_y/K from 0.25 to 0.5": 1.0 / ratio}
     plant = ForeignParameters(
         model=MODEL,
         **varied,
-        servo_law=LAWS[seed % len(LAWS)],
+        servo_law=kind if kind in LAWS else LAWS[(seed % 1000 + turn) % len(LAWS)],
         servo_lag=chance.uniform(0.05, 0.3),
         servo_acceleration=chance.uniform(60.0, 300.0),
-        servo_asymmetry=chance.choice((0.0, 0.0, chance.uniform(-0.2, 0.2))),
-        servo_dead_zone=chance.choice((0.0, chance.uniform(0.0, 0.03))),
-        backlash=chance.choice((0.0, chance.uniform(0.0, 0.05))),
-        servo_delay=chance.uniform(0.0, 0.03),
+        **{name: value for name, (is_on, value) in imperfections.items() if is_on or has_all},
+        quadratic_drag=drag if kind == "quadratic drag" else 0.0,
+        lateral_inertia_ratio=ratios.get(kind, ratio if "from 2 to 4" in kind else 1.0),
     )
     rig = SimulationSettings(
         noise=1e-3 * chance.uniform(0.5, 2.0),
@@ -211,10 +226,3 @@ def foreign_fish(seed: int) -> Config:
         seed=seed,
     )
     return Config(plant=plant, simulation=rig)
-
-
-def best_wave(config: Config) -> float:
-    """Return the thrust of the best square wave whose half beats are whole ticks [N]."""
-    still = replace(config, simulation=SimulationSettings())
-    frequencies = [0.5 / (ticks * config.tick) for ticks in HALF_BEATS]
-    return max(simulate(still, "square", {"frequency": f}, 30.0).mean_thrust for f in frequencies)

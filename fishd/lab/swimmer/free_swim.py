@@ -17,6 +17,7 @@ from fishd.core.signals import Publisher, Reason
 from fishd.lab.simulation.report import count_ticks
 from fishd.lab.simulation.virtual_run import EncodingPublisher, VirtualRun
 from fishd.lab.swimmer.refinement import find_grid_error
+from fishd.lab.swimmer.speed import find_swimmer
 from fishd.virtual.swimmer import checkpoint
 from fishd.virtual.swimmer.checkpoint import Checkpoint, CheckpointError
 from fishd.virtual.swimmer.fish import Diverged
@@ -131,8 +132,7 @@ def swim(
                 "another file to --to"
             )
     with VirtualRun(config, publisher or EncodingPublisher()) as run:
-        fish = run.swimmer
-        assert fish
+        fish = find_swimmer(run)
         track = Track()
         if resume:
             resume.put_into(fish)
@@ -140,7 +140,6 @@ def swim(
             track = Track(resumed_rows)
         resumed_ticks = len(track)
         track.begin(fish)
-        fish.compile()
         on_start(run)
         run.loop.set_controller(name, controller)
         next_write = fish.fish.time + file.every if file else math.inf
