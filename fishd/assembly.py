@@ -3,7 +3,7 @@
 import dataclasses
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from msgspec.structs import replace
 
 from fishd.config import Config
-from fishd.config.drivers import claims_of
+from fishd.config.drivers import claims_of, readings_of
 from fishd.control.estimators.base import Estimator
 from fishd.control.estimators.fin_sensor import FinSensor
 from fishd.control.estimators.lateral_force import LateralForceEstimator
@@ -34,7 +34,8 @@ from fishd.hardware.calibration_files import CalibrationFolder
 from fishd.hardware.driver import ServoDriver, read_counters
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.hardware.recipes import Recipes
-from fishd.hardware.registry import FORCE_SENSORS, POWER_METERS, SERVOS, driver_packages
+from fishd.hardware.registry import FORCE_SENSORS, SENSORS, SERVOS, driver_packages
+from fishd.hardware.sampler import close_all
 from fishd.hardware.servo import pulses
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio import Pigpio
@@ -42,7 +43,7 @@ from fishd.virtual.fish import SimulatedFish
 
 if TYPE_CHECKING:  # most runs need neither drivers nor emulation, so they are loaded on demand
     from fishd.hardware.panel import Panel
-    from fishd.hardware.power_meter.sampled_power import SampledPower
+    from fishd.hardware.sensors.sampled_readings import SampledReadings
     from fishd.virtual.pi.virtual_pi import VirtualPi
 
 log = logging.getLogger(__name__)
@@ -245,9 +246,15 @@ def assemble(
     folder = CalibrationFolder(state_folder(config))
     for line in folder.ignored():
         log.warning("%s", line)
-    meter = _open_power_meter(config, clock, stack, threaded=threaded)
-    between_samples = meter.catch_up if meter else _do_nothing
-    sensor = open_sensor(config, clock, threaded=threaded, between_samples=between_samples)
+    sensors = _open_sensors(config, clock, threaded=threaded)
+    stack.callback(close_all, sensors)
+
+    def read_others() -> None:
+        """Let the other sensors sample between the samples of the force, in virtual time."""
+        for other in sensors:
+            other.read()
+
+    sensor = open_sensor(config, clock, threaded=threaded, between_samples=read_others)
     stack.callback(sensor.close)
     settings = config.servo
     with driver_packages(settings.driver):
@@ -278,7 +285,7 @@ def assemble(
     def limitations() -> tuple[str, ...]:
         lines = (
             *sensor.limitations,
-            *(meter.limitations if meter else ()),
+            *(line for other in sensors for line in other.limitations),
             *servo.driver.limitations,
         )
         if sensor.calibration.is_unset:
@@ -304,9 +311,9 @@ def assemble(
         counters=lambda: {
             **sensor.counters(),
             **read_counters(servo.driver),
-            **(meter.counters() if meter else {}),
+            **{name: count for other in sensors for name, count in other.counters().items()},
         },
-        power=meter.read if meter else None,
+        sensors=sensors,
         countdown=servo.driver.countdown,
         write_recipes=recipes.write_for if recipes else lambda control: None,
     )
@@ -316,20 +323,47 @@ def _do_nothing() -> None:
     pass
 
 
-def _open_power_meter(
-    config: Config, clock: Clock, stack: ExitStack, *, threaded: bool
-) -> "SampledPower | None":
-    """Return the power meter if one is configured; it need not answer yet."""
-    settings = config.power_meter
-    if settings is None:
-        return None
-    from fishd.hardware.power_meter.sampled_power import SampledPower, sample_interval
+def _open_sensors(
+    config: Config, clock: Clock, *, threaded: bool, modelled: Iterable[str] = ()
+) -> "tuple[SampledReadings, ...]":
+    """Return the configured sensors; they need not answer yet.
 
-    with driver_packages(settings.driver):
-        driver = POWER_METERS.find(settings.driver)(settings, clock, sample_interval(config.tick))
-    meter = SampledPower(driver, clock, threaded=threaded, tick=config.tick)
-    stack.callback(meter.close)
-    return meter
+    A simulated fish has stand-ins for those that need hardware.
+
+    modelled: readings that the fish has a model of; a sensor with one of them is left out
+    Raises `StartupError` when a package is missing.
+    """
+    if not config.sensors:
+        return ()
+    from fishd.hardware.sensors.sampled_readings import SampledReadings, sample_period
+    from fishd.hardware.sensors.simulated import StandIn
+
+    sensors = []
+    for name, settings in config.sensors.items():
+        kind, readings = SENSORS.find(settings.kind), readings_of(settings)
+        if readings.keys() & modelled:
+            continue
+        if not (config.kind.has_hardware or kind.is_simulated):
+            kind = StandIn.of(kind)
+        with driver_packages(settings.kind):
+            period = sample_period(kind, settings, config.tick)
+            driver = kind(settings, clock, period, f"sensors.{name}")
+        sensors.append(
+            SampledReadings(name, driver, readings, clock, threaded=threaded, tick=config.tick)
+        )
+    return tuple(sensors)
+
+
+def _with_stand_ins(config: Config, robot: Robot, clock: Clock) -> Robot:
+    """Return a simulated fish with the configured sensors, which its ticks sample."""
+    modelled = {name for sensor in robot.sensors for name in sensor.declared}
+    sensors = _open_sensors(config, clock, threaded=False, modelled=modelled)
+    lines = tuple(line for sensor in sensors for line in sensor.limitations)
+    return dataclasses.replace(
+        robot,
+        sensors=(*robot.sensors, *sensors),
+        limitations=lambda: (*robot.limitations(), *lines),
+    )
 
 
 def open_sensor(
@@ -425,6 +459,8 @@ def build_loop(
     Raises `UnknownController` and `ParameterError`, neither for a configuration from `load`.
     """
     guard = build_guard(config)
+    if config.sensors and not config.kind.has_hardware:
+        robot = _with_stand_ins(config, robot, clock)
     if robot.calibrated:
         guard.restrict(*robot.calibrated.servo.reach)
     loop = ControlLoop(

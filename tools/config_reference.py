@@ -70,11 +70,12 @@ def _rows(section: Struct, prefix: str) -> Iterator[list[str]]:
 def _choice_section(section: str) -> Iterator[str]:
     """Yield the keys of all drivers or plants, then those of each built-in one."""
     plugins, default, settings_of_default, key, page = CHOICES[section]
+    prefix = f"{section}." if default else f"{section}.NAME."
     base = settings_of_default.__base__ if default else Struct
     common = (settings_of_default if base is Struct else base)(**{key: default or ""})
     mine = [name for name in plugins.names() if plugins.package(name) == "fishd"]
     choice, *rows = [
-        _row(field, getattr(common, field.name), f"{section}.") for field in fields_of(type(common))
+        _row(field, getattr(common, field.name), prefix) for field in fields_of(type(common))
     ]
     choice[1] = f"{', '.join(f'`{name}`' for name in mine)}, or [another](../how-to/{page})"
     yield table(HEAD, [choice, *rows])
@@ -82,7 +83,7 @@ def _choice_section(section: str) -> Iterator[str]:
         plugin_class = plugins.find(name)
         settings = plugin_class.Settings(**{key: name})
         own = [
-            _row(field, getattr(settings, field.name), f"{section}.")
+            _row(field, getattr(settings, field.name), prefix)
             for field in fields_of(plugin_class.Settings)
             if not hasattr(common, field.name)
         ]
@@ -108,7 +109,7 @@ def _row(field: Field, default: object, prefix: str) -> list[str]:
 
 def _to_yaml(value: object) -> str:
     """Return a value as YAML."""
-    text: str = yaml.safe_dump(value, default_flow_style=True)
+    text: str = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True)
     return text.removesuffix("\n").removesuffix("\n...")
 
 

@@ -33,6 +33,7 @@ STRUCTS: dict[str, type[Struct]] = {
     "tick": signals.Tick,
     "event": signals.Event,
     "status": signals.Status,
+    "reading": signals.ReadingState,
     "reason": signals.Reason,
     "timing": signals.Timing,
     "distribution": signals.Percentiles,

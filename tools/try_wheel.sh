@@ -19,5 +19,4 @@ fishctl record swim --seconds 3
 fishctl stop
 fishctl plot swim
 test -s swim.png
-test -s swim.html
 fishctl simulate ppo --policy default-fish --seconds 20

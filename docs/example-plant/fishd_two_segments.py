@@ -72,7 +72,7 @@ class TwoSegments(Plant[TwoSegmentsParameters]):
         self, instruction_angle: float | None, duration: float, samples: int
     ) -> PlantWindow:
         """Implement `Plant.advance` by the Runge–Kutta method of order 4."""
-        command = self.state.phi if instruction_angle is None else instruction_angle
+        target = self.state.phi if instruction_angle is None else instruction_angle
         # An even number of steps for each sample, as a sample is taken in the middle.
         steps = 2 * math.ceil(0.5 * duration / samples / MAX_STEP_S)
         h = duration / samples / steps
@@ -81,28 +81,28 @@ class TwoSegments(Plant[TwoSegmentsParameters]):
         peak = abs(self.state.alpha)
         for _ in range(samples):
             for k in range(steps):
-                y = self._step(y, command, h)
+                y = self._step(y, target, h)
                 peak = max(peak, abs(y[1]))
                 if 2 * (k + 1) == steps:
-                    *_, fx, fy = self._rates(y, command)
+                    *_, fx, fy = self._rates(y, target)
                     sampled[0] += fx / samples
                     sampled[1] += fy / samples
         self.state, self._tip = PlantState(*y[:3]), y[3:5]
         return PlantWindow(duration, y[5] / duration, y[6] / duration, *sampled, fin_peak=peak)
 
-    def _step(self, y: Numbers, command: float, h: float) -> Numbers:
-        k1 = self._rates(y, command)
-        k2 = self._rates(_extrapolate(y, k1, 0.5 * h), command)
-        k3 = self._rates(_extrapolate(y, k2, 0.5 * h), command)
-        k4 = self._rates(_extrapolate(y, k3, h), command)
+    def _step(self, y: Numbers, target: float, h: float) -> Numbers:
+        k1 = self._rates(y, target)
+        k2 = self._rates(_extrapolate(y, k1, 0.5 * h), target)
+        k3 = self._rates(_extrapolate(y, k2, 0.5 * h), target)
+        k4 = self._rates(_extrapolate(y, k3, h), target)
         mean = [(a + 2.0 * (b + c) + d) / 6.0 for a, b, c, d in zip(k1, k2, k3, k4, strict=True)]
         return _extrapolate(y, mean, h)
 
-    def _rates(self, y: Numbers, command: float) -> Numbers:
+    def _rates(self, y: Numbers, target: float) -> Numbers:
         """Return the rates of φ, α, α̇, β, β̇; then F_x and F_y, whose integrals are impulses."""
         p = self.parameters
         phi, alpha, alpha_rate, beta, beta_rate, *_ = y
-        turning = p.servo_speed * math.tanh((command - phi) / p.servo_lag)
+        turning = p.servo_speed * math.tanh((target - phi) / p.servo_lag)
         s, pull = p.tip_share, p.tip_omega0**2 * (beta - alpha)
         a = -p.xi * p.omega0 * alpha_rate - p.omega0**2 * (alpha - p.coupling * phi)
         a += s / (1.0 - s) * pull

@@ -82,6 +82,7 @@ class CameraClient:
         """Newest picture for people."""
         self.missed = 0
         """Number of frames that were sent but did not arrive."""
+        self._requests = CameraRequests(self.endpoint, timeout)
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._last_message_time = time.monotonic()
         self._until: float | None = None
@@ -90,7 +91,6 @@ class CameraClient:
         """Number of the latest frame of the session up to which no more frames will arrive."""
         self._last_problem = ""
         try:
-            self._requests = CameraRequests(self.endpoint, self._context, timeout)
             self.state = self.status()
             self._session = self.state.session
             self._camera_clock = ClockOffset(self._read_clock)
@@ -111,6 +111,7 @@ class CameraClient:
 
     def close(self) -> None:
         """Disconnect; may be called twice."""
+        self._requests.close()
         self._context.destroy(linger=0)
 
     def status(self) -> CameraState:

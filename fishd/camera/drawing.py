@@ -75,6 +75,13 @@ def decode_view(view: PublishedView) -> Colours:
     return to_colours(np.asarray(grey, np.uint8))
 
 
+def encode_jpeg(colours: Colours) -> bytes:
+    """Return a picture as JPEG, with all its colours, so that thin lines keep theirs."""
+    sampling = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    _, data = cv2.imencode(".jpg", _swap_red_and_blue(colours), sampling)
+    return data.tobytes()
+
+
 def write_png(path: Path, colours: Colours) -> None:
     """Write a picture; raises `FishdError`."""
     _, data = cv2.imencode(".png", _swap_red_and_blue(colours))

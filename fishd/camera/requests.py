@@ -2,17 +2,17 @@
 
 import itertools
 import os
-import time
 from contextlib import suppress
-from typing import TypeVar, cast
+from functools import partial
+from typing import Self, TypeVar, cast
 
 import msgspec
 import zmq
 
 from fishd.camera.messages import STATE, CameraState
 from fishd.camera.settings import CameraSettings, PublishSettings
-from fishd.client.connection import MAX_UNANSWERED_S, answer_deadlines
-from fishd.client.zmq_sockets import milliseconds_until
+from fishd.client.connection import answer_deadlines
+from fishd.client.request_socket import Requester, RequestSocket
 from fishd.core import addresses, protocol, text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, Refused
@@ -39,24 +39,24 @@ def find_camera() -> str:
 class CameraRequests:
     """Requests to a camera, for one thread; they raise `CameraLost` without a timely answer."""
 
-    def __init__(
-        self, endpoint: str, context: "zmq.Context[zmq.Socket[bytes]]", timeout: float
-    ) -> None:
-        """timeout: longest wait for an answer [s]"""
+    def __init__(self, endpoint: str, timeout: float) -> None:
+        """timeout: longest wait for an answer [s]; raises `CameraLost` for an invalid address."""
+        check_address(endpoint)
         self.endpoint = endpoint
         self.timeout = timeout
-        self._context = context
         self._ids = itertools.count(1)
-        self._asked = 0.0
-        """Time of the first request since the latest answer [s, monotonic]; 0 without one."""
-        self._connect()
+        open_socket = partial(RequestSocket, endpoint, program="fishd-camera")
+        self._requester = Requester(open_socket, forgettable=True)
 
-    def _connect(self) -> None:
-        self._socket = self._context.socket(zmq.DEALER)
-        self._socket.set(zmq.LINGER, 0)
-        self._socket.set(zmq.IMMEDIATE, 1)
-        self._socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-        connect(self._socket, self.endpoint)
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Disconnect; may be called twice."""
+        self._requester.disconnect()
 
     def status(self, timeout: float | None = None) -> CameraState:
         """Return the camera's state; timeout: longest wait [s], None: that of the object."""
@@ -69,30 +69,23 @@ class CameraRequests:
     def _call(self, kind: type[T], op: str, timeout: float | None = None) -> T:
         """Send a request and return its result; raises `CameraLost` and `Refused`."""
         identity = next(self._ids)
-        request = protocol.Request(v=protocol.VERSION, id=identity, op=op)
+        request = protocol.encode(protocol.Request(v=protocol.VERSION, id=identity, op=op))
+
+        def read(payload: bytes) -> T | None:
+            with suppress(msgspec.DecodeError):
+                reply = protocol.decode_reply(payload)
+                if reply.id == identity and reply.error:
+                    raise Refused(text.quoted(reply.error.code), text.line(reply.error.message))
+                if reply.id == identity and reply.result:
+                    return cast(T, decoder(kind)(reply.result))
+            return None
+
         timeout_s = self.timeout if timeout is None else timeout
-        event = zmq.POLLOUT
-        self._asked = self._asked or time.monotonic()
         single_attempt = timeout is not None  # a call within a tick has no time for retries
-        for deadline in answer_deadlines(timeout_s, again=not single_attempt):
-            while self._socket.poll(milliseconds_until(deadline), event):
-                if event == zmq.POLLOUT:
-                    self._socket.send(protocol.encode(request))
-                    event = zmq.POLLIN
-                    continue
-                with suppress(msgspec.DecodeError):
-                    reply = protocol.decode_reply(self._socket.recv_multipart()[-1])
-                    self._asked = 0.0
-                    if reply.id != identity:
-                        continue
-                    if reply.error:
-                        raise Refused(text.quoted(reply.error.code), text.line(reply.error.message))
-                    if reply.result:
-                        return cast(T, decoder(kind)(reply.result))
-        if time.monotonic() - self._asked >= MAX_UNANSWERED_S:
-            self._socket.close()  # a router may have forgotten its connection
-            self._connect()
-            self._asked = 0.0
+        deadlines = answer_deadlines(timeout_s, again=not single_attempt)
+        result = self._requester.exchange(request, read, deadlines)
+        if result is not None:
+            return result
         if not single_attempt and (problem := find_name_problem(self.endpoint)):
             raise CameraLost(f"no camera at {self.endpoint}: {problem}")
         if not single_attempt and self._publishes():
@@ -107,7 +100,7 @@ class CameraRequests:
 
     def _publishes(self) -> bool:
         """Return whether the address sends its state to a new subscriber, as one of frames does."""
-        with self._context.socket(zmq.SUB) as socket:
+        with zmq.Context() as context, context.socket(zmq.SUB) as socket:
             socket.set(zmq.LINGER, 0)
             socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
             socket.subscribe(STATE)
@@ -130,8 +123,8 @@ def resolve_frames_address(frames: str, endpoint: str) -> str:
     return f"tcp://{host}:{frames_address.port}"
 
 
-def connect(socket: "zmq.Socket[bytes]", address: str) -> None:
-    """Connect a socket to an address; raises `CameraLost` when the address is not valid."""
+def check_address(address: str) -> None:
+    """Raise `CameraLost` when an address is not valid."""
     if address.endswith((".yaml", ".yml")) and "://" not in address:
         raise CameraLost(
             f"'{text.quoted(address)}' is a file, for 'fishd-camera --config' and for simulated "
@@ -140,6 +133,11 @@ def connect(socket: "zmq.Socket[bytes]", address: str) -> None:
         )
     if complaint := addresses.find_connect_problem(address):
         raise CameraLost(f"'{address}' is not an address of a camera: {complaint}")
+
+
+def connect(socket: "zmq.Socket[bytes]", address: str) -> None:
+    """Connect a socket to an address; raises `CameraLost` when the address is not valid."""
+    check_address(address)
     try:
         socket.set(zmq.IPV6, addresses.is_ipv6(address))
         socket.connect(address)

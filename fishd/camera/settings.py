@@ -148,11 +148,7 @@ class CameraSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     stream: Annotated[StreamSettings, note("A file or a network camera.")] = StreamSettings()
     picture: Annotated[
         PictureSettings,
-        note(
-            "The part of the picture that frames show. The picture of a simulated camera has "
-            "`size`, and is turned and cropped like any other; learning in simulation does not use "
-            "`picture`."
-        ),
+        note("The part of the picture that frames show; learning in simulation does not use it."),
     ] = PictureSettings()
     publish: Annotated[PublishSettings, note("Addresses of frames and requests.")] = (
         PublishSettings()

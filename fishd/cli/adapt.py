@@ -2,68 +2,50 @@
 
 import shlex
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 import msgspec
 
-from fishd.cli.experiment_options import (
-    ChosenFish,
-    ExperimentEnding,
-    ExperimentFolder,
-    Resumable,
-    fish_choice,
-    folder_options,
-)
-from fishd.cli.options import FiniteRange, json_option, plot_option, seed_option
-from fishd.cli.output import echo, print_json
-from fishd.cli.progress import show_progress
-from fishd.core.errors import FishdError
+from fishd.cli.experiment import ChosenFish, Resumable, Run, experiment_options
+from fishd.cli.options import FiniteRange, seed_option
+from fishd.cli.output import echo
 
 if TYPE_CHECKING:
-    from fishd.learning.adapt.state import Contender, State
+    from fishd.lab.compare.comparison import Standing
+    from fishd.learning.adapt.results import Adapted
 
 DEFAULT_STEPS = 6400
 
 
 @click.command(cls=Resumable)
-@click.option(
-    "--budget",
-    type=FiniteRange(min=150.0, max=3600.0),
-    metavar="SECONDS",
-    default=300.0,
-    show_default=True,
-    help="Largest tank time, rests included [s]: a fifth for the excitation, a seventh for the "
-    "search of swing, a fifth for that of square waves, the rest for the comparison.",
+@experiment_options(
+    click.option(
+        "--budget",
+        type=FiniteRange(min=150.0, max=3600.0),
+        metavar="SECONDS",
+        default=300.0,
+        show_default=True,
+        help="Largest tank time, rests included [s]: a fifth for the excitation, a seventh for "
+        "the search of swing, a fifth for that of square waves, the rest for the comparison.",
+    ),
+    click.option(
+        "--steps",
+        type=click.IntRange(min=640),
+        default=DEFAULT_STEPS,
+        show_default=True,
+        help="Control steps of the training, which runs in simulation while the fish rests.",
+    ),
+    seed_option("the cloud of models and of the training"),
+    click.option(
+        "--no-command",
+        is_flag=True,
+        help="Live: leave the fish at rest at the end. [default: swim the chosen gait]",
+    ),
+    plot="command, fin, force and thrust of each gait",
+    keeps_simulations=True,
 )
-@click.option(
-    "--steps",
-    type=click.IntRange(min=640),
-    default=DEFAULT_STEPS,
-    show_default=True,
-    help="Control steps of the training, which runs in simulation while the fish rests.",
-)
-@seed_option("the cloud of models and of the training")
-@click.option(
-    "--no-command",
-    is_flag=True,
-    help="Live: leave the fish at rest at the end. [default: swim the chosen gait]",
-)
-@fish_choice
-@folder_options
-@plot_option("fit, search, training and comparison")
-@json_option
-def adapt(
-    budget: float,
-    steps: int,
-    seed: int,
-    no_command: bool,
-    fish: ChosenFish,
-    place: ExperimentFolder,
-    picture: Path | None,
-    as_json: bool,
-) -> int:
+def adapt(budget: float, steps: int, seed: int, no_command: bool, run: Run) -> None:
     """Find the best gait of an unknown fish, in five minutes of tank time.
 
     The fish first swims an excitation, and a model is fitted to its forces. swing --C auto finds
@@ -74,65 +56,48 @@ def adapt(
 
     Ctrl-C lets the fish rest; --resume continues without repeating measurements.
     """
-    for package in (
-        "onnxruntime",
-        "tensorboard",
-    ):  # raises for a missing package before the fish swims
+    for package in ("onnxruntime", "tensorboard"):  # before the fish swims
         import_module(package)
-    from fishd.lab import drawing
     from fishd.lab.session import LiveSession
-    from fishd.learning.adapt import report
-    from fishd.learning.adapt.adaptation import Adaptation, add_true_thrusts
-    from fishd.learning.adapt.state import PICTURE, AdaptFolder
+    from fishd.learning.adapt import adaptation
 
-    drawing.check(picture or PICTURE)
-    fish.refuse_other({}, {"--no-command": no_command})
-    settings = {"steps": steps, "seed": seed}
-    with fish.session() as session:
-        session.check_calibrated()
-        with place.open(fish, settings, session) as experiment:
-            run = AdaptFolder(experiment)
-            ending = ExperimentEnding(experiment)
-            fish.announce(as_json)
-            with (
-                ending.measuring(FishdError),
-                session,
-                show_progress(budget, "s of tank time", err=as_json) as show,
-            ):
-                state = Adaptation(session, run, budget, steps, seed, show).run()
-            if ending.is_interrupted:
-                return ending.interrupted(f"{run.state.tank_time:.0f} s of tank time are kept")
-            if fish.on == "simulation":
-                add_true_thrusts(run, fish.load())
-            words = format_command(_chosen_gait(state), fish)
-            files = report.write(run, session.amplitude, words)
-            if picture:
-                report.draw(run, session.amplitude, picture)
-        if as_json:
-            print_json(msgspec.to_builtins(state))
-        else:
-            _print_state(state)
-            echo(f"report: {files[1]}, picture: {files[0]}")
-        chosen = _chosen_gait(state)
-        if isinstance(session, LiveSession) and not no_command:
-            session.fish.set_controller(chosen.controller, **chosen.parameters)
-            echo(f"{chosen.name} swims the fish now; to swim it again: {words}", err=as_json)
-        else:
-            echo(f"to swim it again: {words}", err=as_json)
-    return 0
-
-
-def _chosen_gait(state: "State") -> "Contender":
-    assert state.verdict
-    return next(
-        contender for contender in state.contenders if contender.name == state.verdict.chosen_gait
+    run.fish.refuse_other({}, {"--no-command": no_command})
+    session = run.session()
+    session.check_calibrated()
+    run.open({"budget": budget, "steps": steps, "seed": seed})
+    with run.swimming(budget, "s of tank time") as show:
+        paths = run.pictures("gaits")
+        adapted = adaptation.adapt(session, run.experiment, budget, steps, seed, show, paths)
+    run.check(f"{session.used:.0f} s of tank time are kept")
+    if run.fish.on == "simulation":
+        adapted = adaptation.add_true_thrusts(adapted, run.fish.load())
+    chosen = adapted.chosen
+    summary = {"summary": " ".join(["chosen:", *gait_words(chosen)])}
+    measured = {name: getattr(chosen, name) for name in ("thrust", "thrust_ci95", "total_ci95")}
+    run.show(
+        adapted,
+        lambda: _print_result(adapted),
+        kept=msgspec.to_builtins(adapted) | measured | summary,
     )
+    run.echo_pictures(paths)
+    again = f"to swim it again: {format_command(chosen, run.fish)}"
+    if isinstance(session, LiveSession) and not no_command:
+        session.fish.set_controller(chosen.controller, **chosen.parameters)
+        again = f"{chosen.contestant} swims the fish now; {again}"
+    run.echo(again)
 
 
-def format_command(gait: "Contender", fish: ChosenFish) -> str:
+def gait_words(gait: "Standing") -> list[str]:
+    """Return a gait as fishctl takes it: its controller, and its parameters as options."""
+    words = [gait.controller]
+    for name, value in gait.parameters.items():
+        shown = f"{value:.6g}" if isinstance(value, float) else str(value)
+        words += [f"--{name.replace('_', '-')}", shown]
+    return words
+
+
+def format_command(gait: "Standing", fish: ChosenFish) -> str:
     """Return the command line that swims the same fish with a gait."""
-    from fishd.learning.adapt.report import gait_words
-
     verb = "set-controller" if fish.on == "live" else "simulate"
     words = ["fishctl", verb, *gait_words(gait)]
     words += ["--config", str(fish.file)] if fish.file else []
@@ -141,13 +106,9 @@ def format_command(gait: "Contender", fish: ChosenFish) -> str:
     return shlex.join(words)
 
 
-def _print_state(state: "State") -> None:
-    assert state.verdict
-    echo(f"{state.verdict.claim[0].upper()}{state.verdict.claim[1:]}.")
-    for contender in state.contenders:
-        if contender.true_thrust is not None:
-            echo(
-                f"{contender.name}: truly {1e3 * contender.true_thrust:.2f} mN, "
-                f"{contender.true_relative_thrust:.1%} of the best of all square waves"
-            )
-    echo(f"{state.tank_time:.0f} s of tank time")
+def _print_result(adapted: "Adapted") -> None:
+    echo(f"Verdict: {adapted.verdict}.")
+    for name, thrust in adapted.true_thrusts.items():
+        share = adapted.true_relative_thrusts[name]
+        echo(f"{name}: truly {1e3 * thrust:.2f} mN, {share:.1%} of the best of all square waves")
+    echo(f"{adapted.tank_time:.0f} s of tank time")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 import msgspec
+from msgspec.structs import replace
 
 from fishd.cli.completion import complete_policy
 from fishd.cli.options import endpoint_option, for_option, json_option, take_option, verb_lease
@@ -22,7 +23,7 @@ from fishd.core.signals import Observation
 if TYPE_CHECKING:
     from fishd.camera.live_sight import LiveSight
     from fishd.controllers.policy.runtime import Pilot
-    from fishd.lab.links.fishd_link import FishdLink
+    from fishd.learning.links.fishd_link import FishdLink
 
 CAMERA_LOST_AFTER_S = 2.0
 """Time without frames after which the camera counts as lost [s]."""
@@ -73,13 +74,15 @@ def agent(
         import_module(package)  # `Verbs` names the extra of a missing package
     from fishd.camera.live_sight import LiveSight
     from fishd.controllers.policy.runtime import Pilot
-    from fishd.lab.links.fishd_link import FishdLink
-    from fishd.lab.links.link import LinkLost
+    from fishd.learning.links.fishd_link import FishdLink
+    from fishd.learning.links.link import LinkLost
 
     stopping = threading.Event()
     with on_signal(stopping.set), Fish(endpoint) as fish, ExitStack() as stack:
-        unit = fish.status().force_unit
-        pilot = Pilot(policy, adopt(fish.config()).limits)
+        status = fish.status()
+        unit = status.force_unit
+        limits = replace(adopt(fish.config()).limits, readings=tuple(status.readings))
+        pilot = Pilot(policy, limits)
         sight = None
         if pilot.card.pictures:
             with _name_policy_in_errors(policy):
@@ -161,7 +164,7 @@ class _Swim:
                 echo("no frames: the fish waits at neutral", err=True)
             elif was_waiting and not pilot.waits:
                 echo("frames are back: it swims on", err=True)
-            observation, late, _ = link.step(angle)
+            observation, late = link.step(angle)
             self.duration = observation.time - start
             self._angles.append(abs(observation.instruction_angle))
             self._late_ticks += late

@@ -1,9 +1,6 @@
 """The verb `fishctl compare`, which compares policies and controllers on the same fish."""
 
-import sys
-from contextlib import AbstractContextManager
 from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
@@ -12,22 +9,11 @@ from msgspec.structs import replace
 
 from fishd.cli.completion import complete_contestant
 from fishd.cli.controller_arguments import ControllersCommand
-from fishd.cli.experiment_options import (
-    ChosenFish,
-    ExperimentEnding,
-    ExperimentFolder,
-    Resumable,
-    fish_choice,
-    keep_experiment,
-    live_folder_options,
-    record_session,
-)
-from fishd.cli.options import camera_config_option, for_option, json_option, plot_option
-from fishd.cli.output import echo, print_json
-from fishd.cli.progress import show_progress
+from fishd.cli.experiment import Resumable, Run, experiment_options
+from fishd.cli.options import camera_config_option, for_option
+from fishd.cli.output import echo, echo_table
 from fishd.config import Config, check_tethered
 from fishd.core import text
-from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, ParameterError, install_command
 
 if TYPE_CHECKING:
@@ -35,11 +21,7 @@ if TYPE_CHECKING:
 
     from fishd.lab.compare.comparison import Standing, Trace
     from fishd.lab.compare.contestants import Contestant
-    from fishd.lab.experiment import Experiment
-    from fishd.lab.session import Session
 
-PIPE_TABLE_COLUMNS = 1000
-"""Width of a table in a file or a pipe, where lines are not wrapped [columns]."""
 DEFAULT_RUN_S, DEFAULT_SETTLE_S = 60.0, 10.0
 DEFAULT_RUNS = 5
 """Number of runs of each contestant in simulation where runs differ."""
@@ -52,8 +34,7 @@ class _Outcome(NamedTuple):
     amplitude: float  # rad
     unit: str = "N"
     is_random: bool = True  # whether runs depend on the seed
-    ended: str = ""  # reason of an early end; empty otherwise
-    status: int = 0
+    error: FishdError | None = None  # reason of an early end
 
 
 class _CompareCommand(ControllersCommand, Resumable):
@@ -64,51 +45,47 @@ class _CompareCommand(ControllersCommand, Resumable):
 @click.argument(
     "contestants", nargs=-1, metavar="[POLICY|CONTROLLER]...", shell_complete=complete_contestant
 )
-@click.option(
-    "--runs",
-    type=click.IntRange(1, 1000),
-    help="Runs of each contestant; in simulation, with different noise. "
-    f"[default: {DEFAULT_RUNS} in simulation if they differ, else 1]",
+@experiment_options(
+    click.option(
+        "--runs",
+        type=click.IntRange(1, 1000),
+        help="Runs of each contestant; in simulation, with different noise. "
+        f"[default: {DEFAULT_RUNS} in simulation if they differ, else 1]",
+    ),
+    for_option(
+        "Duration of each run [s]; live, with rests.",
+        default=DEFAULT_RUN_S,
+        kind=click.FLOAT,
+    ),
+    click.option(
+        "--settle",
+        type=float,
+        help=f"In simulation: time before the measurement [s]. [default: {DEFAULT_SETTLE_S}]",
+    ),
+    click.option(
+        "--camera",
+        metavar="ADDRESS",
+        help="For policies that see pictures, live: request address of fishd-camera. [default: "
+        "$FISHD_CAMERA, else that of this machine]",
+    ),
+    camera_config_option("For policies that see pictures, in simulation: "),
+    click.option(
+        "--agent",
+        metavar="ADDRESS",
+        help="For policies that see pictures, on a remote robot: address at which its fishd "
+        "reaches this program. [default: any free port of this machine]",
+    ),
+    plot="command, fin, force and result of each",
 )
-@for_option(
-    "Duration of each run [s]; live, with rests.",
-    default=DEFAULT_RUN_S,
-    kind=click.FLOAT,
-)
-@click.option(
-    "--settle",
-    type=float,
-    help=f"In simulation: time before the measurement [s]. [default: {DEFAULT_SETTLE_S}]",
-)
-@live_folder_options
-@fish_choice
-@click.option(
-    "--camera",
-    metavar="ADDRESS",
-    help="For policies that see pictures, live: request address of fishd-camera. [default: "
-    "$FISHD_CAMERA, else that of this machine]",
-)
-@camera_config_option("For policies that see pictures, in simulation: ")
-@click.option(
-    "--agent",
-    metavar="ADDRESS",
-    help="For policies that see pictures, on a remote robot: address at which its fishd reaches "
-    "this program. [default: any free port of this machine]",
-)
-@json_option
-@plot_option("command, fin, force and result of each")
 def compare(
     contestants: tuple[str, ...],
     runs: int | None,
     seconds: float,
     settle: float | None,
-    fish: ChosenFish,
     camera: str | None,
     camera_config: str | None,
     agent: str | None,
-    place: ExperimentFolder,
-    as_json: bool,
-    picture: Path | None,
+    run: Run,
 ) -> int:
     """Compare policies and controllers on the same fish.
 
@@ -130,53 +107,41 @@ def compare(
     Exit status 1 if this fish refuses a contestant, such as a policy for another amplitude, or if
     a run ends in mode fault; the other contestants are still compared.
     """
-    fish.refuse_other({"--settle": settle, "--camera-config": camera_config}, {"--agent": agent})
-    if picture:
-        from fishd.lab import drawing
-
-        drawing.check(picture)
-    task = _Task(contestants, fish, seconds, settle, runs, camera_config or camera, place, as_json)
-    outcome = _measure(task, agent) if fish.on == "live" else _swim(task)
-    status = _report(outcome, runs or 1, as_json)
-    if picture and outcome.standings:
+    run.fish.refuse_other(
+        {"--settle": settle, "--camera-config": camera_config}, {"--agent": agent}
+    )
+    settings = {"for": seconds, "settle": settle}
+    if run.fish.on == "live":
+        outcome = _measure(run, contestants, settings, runs or 1, camera, agent)
+    else:
+        outcome = _swim(run, contestants, settings, runs, camera_config or camera)
+    status = _report(outcome, runs or 1, run)
+    if run.picture and outcome.standings:
         from fishd.lab.compare.figures import draw
 
-        draw(picture, outcome.standings, outcome.traces, outcome.amplitude, outcome.unit)
+        draw(run.picture, outcome.standings, outcome.traces, outcome.amplitude, outcome.unit)
+    run.check()
+    if outcome.error:
+        run.ending.end_verb(str(outcome.error), 1)
     return status
 
 
-class _Task(NamedTuple):
-    texts: tuple[str, ...]
-    fish: ChosenFish
-    seconds: float
-    settle: float | None
-    runs: int | None
-    camera: str | None
-    """File of a simulated camera; address of the camera of a live fish."""
-    place: ExperimentFolder
-    as_json: bool
-
-    def keep(
-        self, session: "Session | None", chosen: "list[Contestant]"
-    ) -> AbstractContextManager["Experiment | None"]:
-        """Open the folder of the comparison; more runs may be added to it."""
-        settings = {
-            "contestants": list(map(list, chosen)),
-            "for": self.seconds,
-            "settle": self.settle,
-        }
-        return keep_experiment(self.place, self.fish, session, settings)
-
-
-def _swim(task: _Task) -> _Outcome:
+def _swim(
+    run: Run,
+    texts: tuple[str, ...],
+    settings: dict[str, Any],
+    runs: int | None,
+    camera_file: str | None,
+) -> _Outcome:
+    """Swim simulated fish, and return their standings."""
     from fishd.camera import settings as cameras
     from fishd.lab.compare import comparison
     from fishd.lab.compare.contestants import is_missing, parse_all, refusal
 
-    config, camera = task.fish.load(), cameras.load_simulated(task.camera)
+    config, camera = run.fish.load(), cameras.load_simulated(camera_file)
     check_tethered(config.robot, "compare")
-    chosen = parse_all(task.texts) or _default_contestants(config)
-    _check_camera(task.camera, chosen)
+    chosen = parse_all(texts) or _default_contestants(config)
+    _check_camera(camera_file, chosen)
     left_out = [
         (contestant, reason) for contestant in chosen if (reason := refusal(config, contestant))
     ]
@@ -185,63 +150,49 @@ def _swim(task: _Task) -> _Outcome:
             raise reason  # a misspelt path is not a policy for another fish
     refused = [contestant for contestant, _ in left_out]
     accepted = [contestant for contestant in chosen if contestant not in refused]
-    settle = DEFAULT_SETTLE_S if task.settle is None else task.settle
+    seconds, settle = settings["for"], settings["settle"]
+    settle = DEFAULT_SETTLE_S if settle is None else settle
     is_random = config.simulation.is_random
     differ = any(comparison.depends_on_seed(contestant, is_random) for contestant in accepted)
-    runs = task.runs or (DEFAULT_RUNS if differ and len(accepted) > 1 else 1)
-    with task.keep(None, chosen) as experiment:
-        task.fish.announce(task.as_json)
-        with show_progress(len(accepted) * runs * task.seconds, "s swum", err=task.as_json) as bar:
-            result = comparison.compare(
-                config, accepted, task.seconds, settle, runs, bar.at, camera
-            )
-        if experiment:
-            experiment.write_result(result[0])
-    return _Outcome(
-        *result,
-        [(*omitted, 0) for omitted in left_out],
-        config.amplitude_limit,
-        is_random=is_random,
-    )
+    runs = runs or (DEFAULT_RUNS if differ and len(accepted) > 1 else 1)
+    run.open(settings | {"contestants": list(map(list, chosen))})
+    with run.swimming(len(accepted) * runs * seconds, "s swum") as bar:
+        result = comparison.compare(config, accepted, seconds, settle, runs, bar.at, camera)
+    run.check("before the end of all runs")
+    omitted = [(*pair, 0) for pair in left_out]
+    return _Outcome(*result, omitted, config.amplitude_limit, is_random=is_random)
 
 
-def _measure(task: _Task, agent: str | None) -> _Outcome:
+def _measure(
+    run: Run,
+    texts: tuple[str, ...],
+    settings: dict[str, Any],
+    runs: int,
+    camera: str | None,
+    agent: str | None,
+) -> _Outcome:
+    """Measure a live fish, and return the standings until an error or a signal."""
     from fishd.lab.compare.contestants import absolute, parse_all
     from fishd.lab.compare.live import LiveComparison
 
-    ended, status, runs = "", 0, task.runs or 1
-    chosen = list(map(absolute, parse_all(task.texts)))
-    with task.fish.session(camera=task.camera, agent=agent) as session:
-        chosen = chosen or _default_contestants(session.read_config())
-        _check_camera(task.camera, chosen)
-        live = LiveComparison(session, chosen)
-        live.check(task.seconds)  # before the experiment has a folder
-        with task.keep(session, chosen) as experiment:
-            task.fish.announce(task.as_json)
-            ending = ExperimentEnding(experiment)
-            with (  # the fish is at rest after any kind of end
-                ending.measuring(),
-                session,
-                record_session(experiment, session),
-                show_progress(len(chosen) * runs * task.seconds, "s", err=task.as_json) as bar,
-            ):
-                session.progress = bar.at
-                try:
-                    live.swim(task.seconds, runs)
-                except ParameterError:
-                    raise
-                except FishdError as error:
-                    ended, status = f"{error}; {ending.hint}", 1
-            if ended:
-                ending.is_interrupted = True
-            elif ending.is_interrupted:
-                ended, status = f"interrupted; the fish rests; {ending.hint}", INTERRUPTED
-            if experiment:
-                experiment.write_result(live.standings())
+    error, seconds = None, settings["for"]
+    chosen = list(map(absolute, parse_all(texts)))
+    session = run.session(camera=camera, agent=agent)
+    chosen = chosen or _default_contestants(session.read_config())
+    _check_camera(camera, chosen)
+    live = LiveComparison(session, chosen)
+    live.check(seconds)  # before the experiment has a folder
+    run.open(settings | {"contestants": list(map(list, chosen))})
+    try:
+        with run.swimming(len(chosen) * runs * seconds):
+            live.swim(seconds, runs)
+    except ParameterError:
+        raise
+    except FishdError as reason:  # the runs until then are shown
+        error = reason
     return _Outcome(
-        live.standings(), live.traces(), live.left_out, session.amplitude, session.unit, True,
-        ended, status,
-    )  # fmt: skip
+        live.standings(), live.traces(), live.left_out, session.amplitude, session.unit, True, error
+    )
 
 
 def _check_camera(camera: str | None, chosen: "list[Contestant]") -> None:
@@ -273,53 +224,46 @@ def _default_contestants(config: Config) -> "list[Contestant]":
     return default_contestants(config)
 
 
-def _report(outcome: _Outcome, runs: int, as_json: bool) -> int:
+def _report(outcome: _Outcome, runs: int, run: Run) -> int:
     """Print the outcome; return the exit status.
 
     runs: requested runs of each contestant
     """
     from fishd.lab.compare.comparison import judge_standings
+    from fishd.lab.error_budget import warn_of_unknown_calibration
 
     standings = outcome.standings
     verdict = judge_standings(standings, outcome.is_random)
-    if as_json:
-        best = verdict.best if verdict else ()
-        print_json(
-            [to_builtins(s) | {"verdict": _verdict_on(s.contestant, best)} for s in standings]
-        )
-    elif standings:
-        from rich.console import Console
+    best = verdict.best if verdict else ()
 
-        Console(width=None if sys.stdout.isatty() else PIPE_TABLE_COLUMNS, markup=False).print(
-            _make_table(standings, outcome.unit)
-        )
+    def print_table() -> None:
+        if not standings:
+            return
+        echo_table(_make_table(standings, outcome.unit))
         if _are_exact(standings):
             echo("These values have no error: nothing in these runs is random.")
         if sentence := _describe_best_square(standings):
             echo(sentence)
         if verdict:
             echo(f"Verdict: {verdict.sentence}.")
-    measured = [standing for standing in standings if not standing.runs]
-    if measured:
-        from fishd.lab.error_budget import unknown_calibration
 
-        if line := unknown_calibration(measured[0].calibration_ci95, outcome.unit):
-            echo(f"fishctl: {line}", err=True)
+    results = [to_builtins(s) | {"verdict": _verdict_on(s.contestant, best)} for s in standings]
+    run.show(results, print_table)
+    remarks = []
+    measured = [standing for standing in standings if not standing.runs]
+    if measured and (line := warn_of_unknown_calibration(measured[0], outcome.unit)):
+        remarks.append(line)
     for omitted, reason, completed in outcome.left_out:
         when = f" after {completed} of {runs} runs, which are in the table" if completed else ""
-        echo(f"fishctl: {omitted.label}: left out{when}: {reason}", err=True)
+        remarks.append(f"{omitted.label}: left out{when}: {reason}")
     for standing in standings:
         for fallback in standing.fallbacks:
-            echo(
-                f"fishctl: {standing.contestant}: another controller took over: {fallback}",
-                err=True,
-            )
+            remarks.append(f"{standing.contestant}: another controller took over: {fallback}")
     faults = [(standing.contestant, fault) for standing in standings for fault in standing.faults]
-    for contestant, fault in faults:
-        echo(f"fishctl: {contestant}: a run ended in mode fault: {fault}", err=True)
-    if outcome.ended:
-        echo(f"fishctl: {outcome.ended}", err=True)
-    return outcome.status or (1 if faults or outcome.left_out else 0)
+    remarks += [f"{contestant}: a run ended in mode fault: {fault}" for contestant, fault in faults]
+    for remark in remarks:
+        echo(f"fishctl: {remark}", err=True)
+    return 1 if faults or outcome.left_out else 0
 
 
 def _verdict_on(contestant: str, best: tuple[str, ...]) -> str | None:
@@ -338,7 +282,7 @@ def _verdict_on(contestant: str, best: tuple[str, ...]) -> str | None:
 
 def _are_exact(standings: "list[Standing]") -> bool:
     """Return whether all thrusts are without an error."""
-    errors = [_select_half_width(s.thrust_ci95, s.total_ci95) for s in standings]
+    errors = [standing.known_ci95 for standing in standings]
     return all(error is not None and text.format_half_width(error) == "exact" for error in errors)
 
 
@@ -364,9 +308,7 @@ def _make_table(standings: "list[Standing]", unit: str) -> "Table":
         table.add_row(
             standing.contestant,
             *cells,
-            text.format_measured(
-                standing.thrust, _select_half_width(standing.thrust_ci95, standing.total_ci95)
-            ),
+            text.format_measured(standing.thrust, standing.known_ci95),
             *([] if simulated else _error_cells(standing)),
             *(_power_cells(standing) if metered else []),
             f"{standing.frequency:.3f}" if standing.frequency else "–",
@@ -378,18 +320,13 @@ def _make_table(standings: "list[Standing]", unit: str) -> "Table":
 
 def _power_cells(standing: "Standing") -> list[str]:
     """Return the cells of the power and the thrust per watt."""
-    half_width = _select_half_width(
-        standing.thrust_per_watt_ci95, standing.thrust_per_watt_total_ci95
-    )
+    half_width = standing.thrust_per_watt_total_ci95
+    if half_width is None:
+        half_width = standing.thrust_per_watt_ci95
     return [
         f"{standing.power or 0.0:.3f}",
         text.format_measured(standing.thrust_per_watt or 0.0, half_width),
     ]
-
-
-def _select_half_width(statistical_ci95: float | None, total_ci95: float | None) -> float | None:
-    """Return the total half-width of a mean; the statistical one if the total is unknown."""
-    return statistical_ci95 if total_ci95 is None else total_ci95
 
 
 def _error_cells(standing: "Standing") -> list[str]:

@@ -122,7 +122,8 @@ def _read_fish_config(values: dict[str, Any]) -> "Config | None":
     """
     from fishd.config import load
 
-    chosen_fish = values.get("fish")
+    run = values.get("run")
+    chosen_fish = run.fish if run else None
     if chosen_fish.on == "live" if chosen_fish else "endpoint" in values:
         from fishd.client import Fish  # imports zmq, which simulations do not need
 

@@ -8,19 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fishd.cli.experiment_options import (
-    ChosenFish,
-    ExperimentEnding,
-    ExperimentFolder,
-    Resumable,
-    fish_choice_and_config,
-    keep_experiment,
-    live_folder_options,
-    record_session,
-)
-from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
-from fishd.cli.output import echo, print_json
-from fishd.cli.progress import show_progress, show_waiting
+from fishd.cli.experiment import Resumable, Run, experiment_options
+from fishd.cli.options import FiniteRange, for_option
+from fishd.cli.output import echo
+from fishd.cli.progress import show_waiting
 from fishd.cli.recording.files import open_recording
 from fishd.config import Config, ServoSettings, adopt, check_tethered, load
 from fishd.core import files
@@ -28,7 +19,6 @@ from fishd.core.errors import FishdError
 from fishd.recording.reader import open_run
 
 if TYPE_CHECKING:
-    from fishd.lab.experiment import Experiment
     from fishd.lab.identification import Identification
 
 DEFAULT_EXPERIMENT_S = 180.0
@@ -36,50 +26,49 @@ DEFAULT_EXPERIMENT_S = 180.0
 
 @click.command(cls=Resumable)
 @click.argument("runs", nargs=-1, metavar="[RUN]...")
-@click.option("--experiment", is_flag=True, help="First swim an experiment for the identification.")
-@for_option(
-    f"With --experiment: its duration [s]. [default: {DEFAULT_EXPERIMENT_S:g}]",
-    kind=FiniteRange(min=30.0, max=3600.0),
+@experiment_options(
+    click.option(
+        "--experiment", is_flag=True, help="First swim an experiment for the identification."
+    ),
+    for_option(
+        f"With --experiment: its duration [s]. [default: {DEFAULT_EXPERIMENT_S:g}]",
+        kind=FiniteRange(min=30.0, max=3600.0),
+    ),
+    click.option(
+        "--fit",
+        metavar="NAME,...",
+        help="Parameters to fit; the others keep their configured values. [default: omega0, xi, "
+        "quadratic_drag, coupling, servo_speed, servo_lag, thrust_coefficient, "
+        "lateral_inertia_ratio, lateral_drag, servo_delay, backlash, rotation; and if the forces "
+        "show them lateral_quadratic_drag, cable_slack, servo_dead_zone, servo_reaction]",
+    ),
+    click.option(
+        "--fix",
+        metavar="NAME,...",
+        help="Known parameters, which are not fitted: lateral_inertia_ratio if K_y = K, or "
+        "coupling if λ was measured.",
+    ),
+    click.option(
+        "--to",
+        "target",
+        type=click.Path(path_type=Path, dir_okay=False),
+        metavar="FILE",
+        help="Write the sections plant and simulation of a configuration into this file.",
+    ),
+    click.option("--force", is_flag=True, help="Overwrite FILE."),
+    plot="forces, fit and residual",
+    live_config=True,
 )
-@live_folder_options
-@fish_choice_and_config
-@click.option(
-    "--fit",
-    metavar="NAME,...",
-    help="Parameters to fit; the others keep their configured values. [default: omega0, xi, "
-    "quadratic_drag, coupling, servo_speed, servo_lag, thrust_coefficient, lateral_inertia_ratio, "
-    "lateral_drag, servo_delay, backlash, rotation; and if the forces show them "
-    "lateral_quadratic_drag, cable_slack, servo_dead_zone, servo_reaction]",
-)
-@click.option(
-    "--fix",
-    metavar="NAME,...",
-    help="Known parameters, which are not fitted: lateral_inertia_ratio if K_y = K, or coupling if "
-    "λ was measured.",
-)
-@click.option(
-    "--to",
-    "target",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="Write the sections plant and simulation of a configuration into this file.",
-)
-@click.option("--force", is_flag=True, help="Overwrite FILE.")
-@plot_option("forces, fit and residual")
-@json_option
 def identify(
     runs: tuple[str, ...],
     experiment: bool,
     seconds: float | None,
-    place: ExperimentFolder,
-    fish: ChosenFish,
     fit: str | None,
     fix: str | None,
     target: Path | None,
     force: bool,
-    picture: Path | None,
-    as_json: bool,
-) -> int:
+    run: Run,
+) -> None:
     """Identify a fish and its rig from F_x, F_y and φ_c, with 95 % intervals.
 
     RUN is a path, a name in the folder of recordings, or 'latest'. Several recordings are fitted
@@ -90,15 +79,11 @@ def identify(
     """
     if experiment == bool(runs):
         raise click.UsageError("name recordings to identify, or use --experiment: one of the two")
-    for option, is_given in (("--for", seconds is not None), ("--folder", place.is_named)):
+    for option, is_given in (("--for", seconds is not None), ("--folder", run.has_folder)):
         if is_given and not experiment:
             raise click.UsageError(f"{option} goes with --experiment")
     if target and target.exists() and not force:
         raise FishdError(f"{target}: exists already; --force overwrites it, --to names another")
-    if picture:
-        from fishd.lab.drawing import check
-
-        check(picture)
 
     from fishd.lab import identification as lab
 
@@ -106,80 +91,61 @@ def identify(
     fixed = _parse_names(fix or "")
     lab.check(lab.DEFAULT if names is None else names, fixed)  # before minutes of swimming
     if experiment:
-        swum = _swim_experiment(fish, seconds or DEFAULT_EXPERIMENT_S, place, as_json)
-        if isinstance(swum, int):
-            return swum
-        config, tables, servo, kept = swum
-        origin = f"an experiment with {fish}"
+        config, tables, servo = _swim_experiment(run, seconds or DEFAULT_EXPERIMENT_S)
+        origin = f"an experiment with {run.fish}"
     else:
-        config, servo, kept = load(fish.file, fish.overrides), None, None
+        config, servo = load(run.fish.file, run.fish.overrides), None
         check_tethered(config.robot, "identify")
-        tables = [open_recording(run, None) for run in runs]
-        origin = ", ".join(run.path.name for run in tables)
+        tables = [open_recording(name, None) for name in runs]
+        origin = ", ".join(table.path.name for table in tables)
     with show_waiting("fitting the model to the forces"):
         identification = lab.identify(
             tables, start=config.plant, rig=config.simulation, fit=names, fix=fixed, servo=servo
         )
     result = identification.to_builtins() | {"origin": origin}
-    if kept:
-        kept.write_result(result | {"summary": identification.summary})
-    if as_json:
-        print_json(result)
-    else:
-        _print_result(identification)
-        echo(f"from {origin}")
+    run.show(
+        result,
+        lambda: _print_result(identification, origin),
+        kept=result | {"summary": identification.summary},
+    )
     for remark in identification.remarks:
         echo(f"fishctl: careful: {remark}", err=True)
     if target:
         _write_config(target, identification.to_yaml(f"{origin} on {datetime.now():%Y-%m-%d}"))
-    if picture:
+    if run.picture:
         from fishd.lab.identification.figure import draw
 
-        draw(identification, picture)
-    return 0
+        draw(identification, run.picture)
 
 
 def _parse_names(listed: str) -> tuple[str, ...]:
     return tuple(filter(None, listed.replace(" ", "").split(",")))
 
 
-def _swim_experiment(
-    fish: ChosenFish, seconds: float, place: ExperimentFolder, as_json: bool
-) -> "tuple[Config, list[Any], ServoSettings | None, Experiment | None] | int":
+def _swim_experiment(run: Run, seconds: float) -> "tuple[Config, list[Any], ServoSettings | None]":
     """Swim an experiment, or the rest of one that is resumed.
 
-    Return the start configuration of the fit, the tables of ticks, the settings of the servo and
-    the folder that is kept; the exit status if it was interrupted.
+    Return the start configuration of the fit, the tables of ticks and the settings of the servo.
     """
     from fishd.lab.identification import continue_experiment
     from fishd.recording.folder import list_recordings
 
-    with (
-        fish.session() as session,
-        keep_experiment(place, fish, session, {"for": seconds}) as experiment,
-    ):
-        if fish.on == "simulation":
-            config = fish.load()
-        elif fish.file:
-            config = load(fish.file, fish.overrides)
-        else:
-            config = adopt(deepcopy(session.config), fish.overrides)
-        session.check_calibrated()
-        fish.announce(as_json)
-        before = []
-        if place.resume and fish.on == "live":
-            before = [open_run(path).frame() for path in list_recordings(place.path)]
-        ending = ExperimentEnding(experiment)
-        with (
-            ending.measuring(),
-            session,
-            record_session(experiment, session, logged=False),
-            show_progress(seconds, "s", err=as_json) as bar,
-        ):
-            session.progress = bar.at
-            tables = continue_experiment(session, before, seconds)
-            return config, tables, session.servo, experiment
-    return ending.interrupted("before the fit")
+    session, fish = run.session(), run.fish
+    if fish.on == "simulation":
+        config = fish.load()
+    elif fish.file:
+        config = load(fish.file, fish.overrides)
+    else:
+        config = adopt(deepcopy(session.config), fish.overrides)
+    session.check_calibrated()
+    run.open({"for": seconds})
+    before: list[Any] = []
+    if run.is_resumed and fish.on == "live":
+        before = [open_run(path).frame() for path in list_recordings(run.folder)]
+    with run.swimming(seconds, since=sum(map(len, before)) * session.tick, logged=False):
+        tables = continue_experiment(session, before, seconds)
+    run.check("before the fit")
+    return config, tables, session.servo
 
 
 def _write_config(target: Path, text: str) -> None:
@@ -192,7 +158,7 @@ def _write_config(target: Path, text: str) -> None:
     )
 
 
-def _print_result(identification: "Identification") -> None:
+def _print_result(identification: "Identification", origin: str) -> None:
     from fishd.lab.identification.figure import format_estimate, format_if_ratio_holds
 
     echo(identification.headline)
@@ -227,3 +193,4 @@ def _print_result(identification: "Identification") -> None:
         else f", in {identification.passages} parts without a gap"
     )
     echo(f"fitted to {identification.seconds:.0f} s of swimming{parts}")
+    echo(f"from {origin}")

@@ -1,6 +1,7 @@
 """Printing of values: control characters of a daemon or a file never reach the terminal."""
 
 import re
+import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -16,11 +17,15 @@ from fishd.core.schema import format_values
 from fishd.core.signals import Reason
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from fishd.client import Fish
     from fishd.core.protocol import State
 
 T = TypeVar("T")
 
+PIPE_COLUMNS = 1000
+"""Width of a table in a file or a pipe [columns]."""
 _MAX_OUTPUT_CHARACTERS = 1_000_000
 """Largest output that is not cut, more than any verb prints [characters]."""
 
@@ -54,6 +59,13 @@ def echo_rows(rows: Sequence[tuple[str, str]]) -> None:
     """Print names and values in two columns."""
     width = max(12, *(len(name) + 1 for name, _ in rows))
     echo("\n".join(f"{name:<{width}}{value}" for name, value in rows))
+
+
+def echo_table(table: "Table") -> None:
+    """Print a table; in a file or a pipe, its lines are not wrapped."""
+    from rich.console import Console
+
+    Console(width=None if sys.stdout.isatty() else PIPE_COLUMNS, markup=False).print(table)
 
 
 def print_json(value: Any) -> None:
@@ -128,6 +140,14 @@ def warn_of_fin(amplitude: float, where: str = "") -> None:
             "rad the equations of the fish do not hold, nor does this thrust",
             err=True,
         )
+
+
+def format_speed(speed: float, ci95: float | None, grid_error: float | None) -> str:
+    """Return a speed with its errors by averaging and by the grid."""
+    value = text.format_measured(speed, ci95, "m/s")
+    if grid_error is None:
+        return f"{value}, grid error not known (fishctl swimmer refine)"
+    return f"{value}, {text.format_half_width(grid_error)} by the grid"
 
 
 def format_time_of_day(t: float) -> str:

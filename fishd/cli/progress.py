@@ -29,8 +29,8 @@ class Lines:
         """Print what was done; amount: amount of the total that is done."""
         echo(line, err=self._err)
 
-    def at(self, amount: float, latest_result: str = "") -> None:
-        """Show the amount of the total that is done, and the latest result."""
+    def at(self, amount: float, latest_result: str | None = None) -> None:
+        """Show the amount of the total that is done, and a new latest result."""
 
     def warn(self, line: str) -> None:
         """Print a line on standard error."""
@@ -54,9 +54,10 @@ class Bar(Lines):
             super().done(line, amount)
         self.at(amount)
 
-    def at(self, amount: float, latest_result: str = "") -> None:
+    def at(self, amount: float, latest_result: str | None = None) -> None:
         """Move the bar; the latest result stands to its right."""
-        self._progress.update(self._task, completed=amount, description=text.line(latest_result))
+        description = None if latest_result is None else text.line(latest_result)
+        self._progress.update(self._task, completed=amount, description=description)
 
     def warn(self, line: str) -> None:
         """Print a line above the bar."""

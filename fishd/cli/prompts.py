@@ -1,14 +1,16 @@
-"""Prompts that a signal ends, whenever it comes."""
+"""Prompts and waits that a signal ends, whenever it comes."""
 
 import os
+import select
 import signal
+import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import click
 
-from fishd.core.process.interruption import handle_signals
+from fishd.core.process.interruption import SIGNALS, handle_signals
 
 _REPEAT_INTERVAL_S = 0.1
 """Time between two interruptions of a system call [s]."""
@@ -44,6 +46,22 @@ def input_interrupted() -> Iterator[None]:
             os.close(writer)
             thread.join()
             os.close(reader)
+
+
+@contextmanager
+def caught_signals() -> Iterator[Callable[[float], bool]]:
+    """Yield a function that waits for one of the three signals, up to some seconds.
+
+    It returns True once one has come. Main thread only.
+    """
+    reader, writer = socket.socketpair()
+    with reader, writer, handle_signals(SIGNALS, lambda *_: None):
+        writer.setblocking(False)  # required by `signal.set_wakeup_fd`
+        before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+        try:
+            yield lambda seconds: bool(select.select([reader], [], [], seconds)[0])
+        finally:
+            signal.set_wakeup_fd(before)
 
 
 def choose(prompt: str, *words: str, suffix: str = ": ") -> str:

@@ -118,7 +118,7 @@ def _do_nothing(_: "VirtualRun") -> None:
 
 
 def _describe(writer: "RunWriter", config: Config, run: "VirtualRun") -> None:
-    writer.describe(config, run.about())
+    writer.describe(config, run.about(), run.readings)
 
 
 def _open_recording(path: Path) -> "RunWriter":

@@ -16,7 +16,7 @@ from fishd.cli.output import (
     report_detour,
 )
 from fishd.client import Fish
-from fishd.core.console import format_power, format_thrust
+from fishd.core.console import format_reading, format_thrust
 from fishd.core.robots import find_kind
 from fishd.core.schema import format_values
 from fishd.core.signals import Percentiles, Status
@@ -70,6 +70,7 @@ def _status_rows(status: Status, address: str) -> list[tuple[str, str]]:
         ("angle", f"{_format_angle(status)}, {_format_range(status)}"),
         *_thrust_rows(status),
         *([("leak", f"{status.leak:.3g} s, estimated")] if status.leak is not None else []),
+        *_reading_rows(status),
         *_criterion_rows(status),
         *([("shows", shown)] if (shown := _format_shown(status)) else []),
         *([("calibrating", "the servo, by a client")] if status.calibrating else []),
@@ -97,9 +98,18 @@ def _thrust_rows(status: Status) -> list[tuple[str, str]]:
     rows = [("thrust", f"{format_thrust(status)} at {status.frequency:.2f} Hz")]
     if status.thrust_ci95 is None and not status.sensor_lost:
         rows.append(("", _ZERO_UNKNOWN_NOTE))
-    if status.power is not None:
-        rows.append(("power", f"{format_power(status.power)} into the servo, mean of 2 s"))
     return rows
+
+
+def _reading_rows(status: Status) -> list[tuple[str, str]]:
+    """Return a row for each sensor, with its readings, and their age if it is long."""
+    rows: dict[str, list[str]] = {}
+    for name, reading in status.readings.items():
+        shown = "–" if reading.value is None else format_reading(reading)
+        age = reading.age or 0.0
+        shown += f" ({age:.0f} s old)" if age >= 2.0 else ""
+        rows.setdefault(reading.sensor, []).append(f"{name} {shown}")
+    return [(sensor, ", ".join(values)) for sensor, values in rows.items()]
 
 
 def _timing_rows(status: Status) -> list[tuple[str, str]]:

@@ -1,8 +1,7 @@
 """The verb `fishctl sweep`, which measures thrust or speed over a grid of parameters."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -10,26 +9,17 @@ import msgspec
 from msgspec.structs import replace
 
 from fishd.cli.controller_arguments import ValuesType
-from fishd.cli.experiment_options import (
-    ChosenFish,
-    ExperimentEnding,
-    ExperimentFolder,
-    ResumableGroup,
-    fish_choice,
-    folder_options,
-)
-from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
-from fishd.cli.output import echo, format_count, print_json, warn_of_fin
-from fishd.cli.progress import show_progress
-from fishd.cli.swimmer.simulation import format_speed
+from fishd.cli.experiment import ChosenFish, ResumableGroup, Run, experiment_options
+from fishd.cli.options import FiniteRange, for_option
+from fishd.cli.output import echo, format_count, format_speed, warn_of_fin
 from fishd.config import Config
 from fishd.controllers.base import Limits
 from fishd.core import text
 from fishd.core.errors import ConfigError
+from fishd.core.process.interruption import Interrupted
 from fishd.core.signals import ControllerInfo
 
 if TYPE_CHECKING:
-    from fishd.lab.experiment import Experiment
     from fishd.lab.sweep.curves import Best, WholeTicks
     from fishd.lab.sweep.grid import Point
     from fishd.lab.sweep.results import PointResult, Quantity, SweepFolder
@@ -37,47 +27,41 @@ if TYPE_CHECKING:
 DEFAULT_POINT_S = 30.0
 
 
-def sweep_options(function: Any) -> Any:
-    """Add the options of the verb itself."""
-    for option in (
-        json_option,
-        plot_option("the curves"),
-        fish_choice,
-        folder_options,
-        click.option(
-            "--cluster",
-            metavar="ADDRESS",
-            help="In simulation: let the workers of a Dask cluster swim; address of its scheduler, "
-            "or its file NAME.json. --resume without it swims on this machine.",
-        ),
-        click.option(
-            "--jobs",
-            type=click.IntRange(min=1),
-            help="In simulation: number of processes. [default: number of cores]",
-        ),
-        for_option(f"Live: swimming and resting at each point [s]. [default: {DEFAULT_POINT_S:g}]"),
-        click.option(
-            "--periods",
-            type=click.IntRange(2, 10_000),
-            help="In simulation: measured tail beats of each point; of a free fish, the "
-            "smallest number. [default: 20; of a free fish 10]",
-        ),
-        click.option(
-            "--settle",
-            type=FiniteRange(0.0, 100_000.0),
-            help="In simulation: time before the measured beats [s]. [default: 10; of a free fish "
-            "4, or until its speed is steady]",
-        ),
-        click.option(
-            "--vary",
-            multiple=True,
-            metavar="KEY=VALUES",
-            help="In simulation: a key of the configuration with several values, such as "
-            "plant.xi=0.6,1.2,2.4 or plant.omega0=8:14:2. Repeatable.",
-        ),
-    ):
-        function = option(function)
-    return function
+sweep_options = experiment_options(
+    click.option(
+        "--vary",
+        multiple=True,
+        metavar="KEY=VALUES",
+        help="In simulation: a key of the configuration with several values, such as "
+        "plant.xi=0.6,1.2,2.4 or plant.omega0=8:14:2. Repeatable.",
+    ),
+    click.option(
+        "--settle",
+        type=FiniteRange(0.0, 100_000.0),
+        help="In simulation: time before the measured beats [s]. [default: 10; of a free fish "
+        "4, or until its speed is steady]",
+    ),
+    click.option(
+        "--periods",
+        type=click.IntRange(2, 10_000),
+        help="In simulation: measured tail beats of each point; of a free fish, the "
+        "smallest number. [default: 20; of a free fish 10]",
+    ),
+    for_option(f"Live: swimming and resting at each point [s]. [default: {DEFAULT_POINT_S:g}]"),
+    click.option(
+        "--jobs",
+        type=click.IntRange(min=1),
+        help="In simulation: number of processes. [default: number of cores]",
+    ),
+    click.option(
+        "--cluster",
+        metavar="ADDRESS",
+        help="In simulation: let the workers of a Dask cluster swim; address of its scheduler, "
+        "or its file NAME.json. --resume without it swims on this machine.",
+    ),
+    plot="the curves",
+    keeps_simulations=True,
+)
 
 
 @click.group(cls=ResumableGroup, options=sweep_options, remote=True, kind=ValuesType)
@@ -103,30 +87,28 @@ def _sweep(
     seconds: float | None,
     jobs: int | None,
     cluster: str | None,
-    place: ExperimentFolder,
-    fish: ChosenFish,
-    picture: Path | None,
-    as_json: bool,
+    run: Run,
 ) -> int:
-    from fishd.lab import drawing
     from fishd.lab.sweep import grid
 
-    drawing.check_installed()
-    if picture:
-        drawing.check(picture)
     simulation_options = {
         "--vary": vary, "--settle": settle, "--periods": periods, "--jobs": jobs,
         "--cluster": cluster,
     }  # fmt: skip
-    fish.refuse_other(simulation_options, {"--for": seconds})
+    run.fish.refuse_other(simulation_options, {"--for": seconds})
     names = [info.name for info in infos]
     accepted = {info.name: [field.name for field in info.parameters] for info in infos}
-    units = {field.name: field.unit for info in infos for field in info.parameters}
     points = grid.make_points(names, parameters, accepted, _parse_variations(vary))
-    task = _Sweep(points, units, place, fish, picture, as_json)
-    if fish.on == "live":
-        return task.measure(DEFAULT_POINT_S if seconds is None else seconds)
-    return task.swim({"settle": settle, "periods": periods}, {"jobs": jobs, "cluster": cluster})
+    if run.fish.on == "live":
+        folder = _measure(run, points, DEFAULT_POINT_S if seconds is None else seconds)
+    else:
+        folder = _swim(run, points, settle, periods, jobs, cluster)
+    units = {field.name: field.unit for info in infos for field in info.parameters}
+    folder.sort(points)
+    _show(run, folder, points, units)
+    kept = sum(folder.key(point) in folder.results for point in points)
+    run.check(f"{kept} of {format_count(len(points), 'point')} are kept")
+    return 1 if any(folder.results[folder.key(point)].failure for point in points) else 0
 
 
 def _parse_variations(texts: Sequence[str]) -> dict[str, list[Any]]:
@@ -144,160 +126,126 @@ def _parse_variations(texts: Sequence[str]) -> dict[str, list[Any]]:
     return variations
 
 
-@dataclass
-class _Sweep:
-    """A sweep from the command line."""
+def _swim(
+    run: Run,
+    points: "list[Point]",
+    settle: float | None,
+    periods: int | None,
+    jobs: int | None,
+    cluster: str | None,
+) -> "SweepFolder":
+    """Swim simulated fish at the points, and return their results."""
+    from fishd.lab.sweep.grid import Lengths
+    from fishd.lab.sweep.measuring import swim_all
 
-    points: "list[Point]"
-    units: dict[str, str]
-    """Units of the parameters, by name."""
-    place: ExperimentFolder
-    fish: ChosenFish
-    picture: Path | None
-    as_json: bool
-    finished: int = 0
+    pairs = _configure_points(run.fish, points)
+    lengths = Lengths.of(run.fish.load(), settle, periods)
+    run.open({"lengths": msgspec.to_builtins(lengths)}, cluster)
+    folder, finished = _open_folder(run, points)
+    with run.swimming(len(points), "points") as show:
+        show.at(finished)
+        with closing(swim_all(folder, pairs, lengths, jobs, cluster)) as results:
+            for point, result in results:
+                finished += 1
+                line = f"{point.label()}: {_format_result(result, folder.quantity)}"
+                show.done(line, finished)
+        if finished < len(points):
+            raise Interrupted
+    return folder
 
-    def swim(self, given: dict[str, Any], workers: dict[str, Any]) -> int:
-        """Swim simulated fish; given: durations, workers: processes or cluster."""
-        from fishd.lab.sweep.grid import Lengths
-        from fishd.lab.sweep.measuring import swim_all
-        from fishd.lab.workers import Unfinished
 
-        pairs = self._configure_points()
-        config = self.fish.load()
-        lengths = Lengths.of(config, **given)
-        settings = {"lengths": msgspec.to_builtins(lengths)}
-        with self.place.open(self.fish, settings, None) as experiment:
-            folder = self._open_folder(experiment)
-            ending = ExperimentEnding(experiment, workers["cluster"])
-            with (
-                ending.measuring(Unfinished),
-                show_progress(len(pairs), "points", err=self.as_json) as show,
-            ):
-                show.at(self.finished)
+def _measure(run: Run, points: "list[Point]", seconds: float) -> "SweepFolder":
+    """Measure a live fish, each point for `seconds`, and return the results."""
+    from fishd.lab.sweep import grid
+    from fishd.lab.sweep.measuring import measure_all
+    from fishd.lab.swim_plan import plan
 
-                def done(point: "Point", result: "PointResult") -> None:
-                    show.done(self._finish_point(folder, point, result), self.finished)
+    for point in points:
+        plan(seconds, point.parameters)  # raises for too short a time before the fish moves
+    session = run.session()
+    grid.check_remote(points, Limits(session.amplitude, session.tick))
+    run.open({"lengths": {"seconds": seconds}})
+    folder, finished = _open_folder(run, points)
+    since = finished * seconds
+    with run.swimming(len(points) * seconds, since=since, recorded=False) as show:
+        for point, result in measure_all(folder, points, session, seconds):
+            line = f"{point.label()}: {_format_result(result, folder.quantity)}"
+            show.done(line, since + session.used)
+    return folder
 
-                ending.is_interrupted = not swim_all(folder, pairs, lengths, done, **workers)
-            folder.sort(self.points)
-            return self._conclude(folder, ending, "the mean over beats")
 
-    def measure(self, seconds: float) -> int:
-        """Measure a live fish; seconds: duration of each point [s]."""
-        from fishd.lab.sweep import grid
-        from fishd.lab.sweep.measuring import measure_all
-        from fishd.lab.swim_plan import plan
+def _configure_points(fish: ChosenFish, points: "list[Point]") -> "list[tuple[Point, Config]]":
+    """Return each point with the configuration of its fish, after checking all points."""
+    from fishd.lab.sweep import grid
 
-        for point in self.points:
-            plan(
-                seconds, point.parameters
-            )  # raises an error for too short a time before the fish moves
-        settings = {"lengths": {"seconds": seconds}}
-        with self.fish.session() as session:
-            grid.check_remote(self.points, Limits(session.amplitude, session.tick))
-            with self.place.open(self.fish, settings, session) as experiment:
-                folder = self._open_folder(experiment)
-                ending = ExperimentEnding(experiment)
-                session.used = self.finished * seconds
-                with (
-                    ending.measuring(),
-                    session,
-                    show_progress(len(self.points) * seconds, "s", err=self.as_json) as show,
-                ):
-                    session.progress = show.at
+    configs: dict[tuple[tuple[str, Any], ...], Config] = {}
+    for point in points:
+        changed = tuple(point.keys.items())
+        if changed not in configs:
+            configs[changed] = _configure_fish(fish, point)
+        grid.check(point, replace(configs[changed].limits, virtual=True))
+    return [(point, configs[tuple(point.keys.items())]) for point in points]
 
-                    def done(point: "Point", result: "PointResult") -> None:
-                        show.done(self._finish_point(folder, point, result), session.used)
 
-                    measure_all(folder, self.points, session, seconds, done)
-                folder.sort(self.points)
-                return self._conclude(folder, ending, "the measurement")
+def _configure_fish(fish: ChosenFish, point: "Point") -> Config:
+    pairs = [f"{key}={value}" for key, value in point.keys.items()]
+    try:
+        return fish.load(pairs)
+    except ConfigError as error:
+        message = str(error)
+        for pair in pairs:
+            message = message.replace(f"--set {pair}", f"--vary {pair}")
+        raise ConfigError(message) from None
 
-    def _configure_points(self) -> "list[tuple[Point, Config]]":
-        """Return each point with the configuration of its fish, after checking all points."""
-        from fishd.lab.sweep import grid
 
-        fish: dict[tuple[tuple[str, Any], ...], Config] = {}
-        for point in self.points:
-            changed = tuple(point.keys.items())
-            if changed not in fish:
-                fish[changed] = self._configure_fish(point)
-            grid.check(point, replace(fish[changed].limits, virtual=True))
-        return [(point, fish[tuple(point.keys.items())]) for point in self.points]
+def _open_folder(run: Run, points: "list[Point]") -> "tuple[SweepFolder, int]":
+    """Open the table, and print how many points it already has; return both."""
+    from fishd.lab.sweep.results import SweepFolder
 
-    def _configure_fish(self, point: "Point") -> Config:
-        pairs = [f"{key}={value}" for key, value in point.keys.items()]
-        try:
-            return self.fish.load(pairs)
-        except ConfigError as error:
-            message = str(error)
-            for pair in pairs:
-                message = message.replace(f"--set {pair}", f"--vary {pair}")
-            raise ConfigError(message) from None
+    columns = dict.fromkeys(name for point in points for name in point.columns())
+    folder = SweepFolder(run.experiment, list(columns))
+    finished = sum(folder.key(point) in folder.results for point in points)
+    already_measured = f", {finished} of them measured already" if finished else ""
+    run.echo(f"{folder.path}: {format_count(len(points), 'point')}{already_measured}")
+    return folder, finished
 
-    def _open_folder(self, experiment: "Experiment") -> "SweepFolder":
-        """Open the table, and print how many points it already has."""
-        from fishd.lab.sweep.results import SweepFolder
 
-        columns = dict.fromkeys(name for point in self.points for name in point.columns())
-        folder = SweepFolder(experiment, list(columns))
-        self.finished = sum(folder.key(point) in folder.results for point in self.points)
-        already_measured = f", {self.finished} of them measured already" if self.finished else ""
-        self.fish.announce(self.as_json)
-        echo(
-            f"{folder.path}: {format_count(len(self.points), 'point')}{already_measured}",
-            err=self.as_json,
-        )
-        return folder
+def _show(run: Run, folder: "SweepFolder", points: "list[Point]", units: dict[str, str]) -> None:
+    """Print the best points, and draw the curves; units: those of the parameters, by name."""
+    from fishd.lab.sweep import curves, figure
 
-    def _finish_point(self, folder: "SweepFolder", point: "Point", result: "PointResult") -> str:
-        """Return a line about a finished point."""
-        self.finished += 1
-        return f"{point.label()}: {_format_result(result, folder.quantity)}"
+    quantity = folder.quantity
+    all_curves = curves.make_curves(folder, points)
+    bests = [
+        (curve, replace(best, whole_ticks=curves.find_best_of_whole_ticks(folder, curve)))
+        for curve in all_curves
+        if (best := curves.find_best(curve))
+    ]
 
-    def _conclude(self, folder: "SweepFolder", ending: ExperimentEnding, error_of: str) -> int:
-        """Print the best points, and draw the curves; return the exit status."""
-        from fishd.lab.sweep import curves, figure
+    def print_bests() -> None:
+        for curve, best in bests:
+            unit = units.get(best.x_name, "")
+            echo(f"{curve.label}: {_format_best(best, unit, quantity.unit)}")
+            if best.whole_ticks:
+                description = _format_whole_ticks(best.whole_ticks, quantity.unit)
+                echo(f"{curve.label}, of whole ticks: {description}")
+        _echo_grid_errors(folder, points)
+        echo(f"table: {folder.path / 'rows.csv'}")
 
-        points, quantity = self.points, folder.quantity
-        all_curves = curves.make_curves(folder, points)
-        bests = [
-            (curve, replace(best, whole_ticks=curves.find_best_of_whole_ticks(folder, curve)))
-            for curve in all_curves
-            if (best := curves.find_best(curve))
-        ]
-        best_points = [curves.best_to_builtins(best, quantity) for _, best in bests]
-        folder.experiment.write_result(best_points)
-        if self.as_json:
-            print_json(best_points)
-        else:
-            for curve, best in bests:
-                unit = self.units.get(best.x_name, "")
-                echo(f"{curve.label}: {_format_best(best, unit, quantity.unit)}")
-                if best.whole_ticks:
-                    description = _format_whole_ticks(best.whole_ticks, quantity.unit)
-                    echo(f"{curve.label}, of whole ticks: {description}")
-            _echo_grid_errors(folder, points)
-            echo(f"table: {folder.path / 'rows.csv'}")
-        if any(curve.peak for curve in all_curves):
-            stem = folder.path / quantity.name
-            paths = [self.picture] if self.picture else [Path(f"{stem}.png"), Path(f"{stem}.svg")]
-            figure.draw(paths, all_curves, self.units, error_of=error_of, quantity=quantity)
-            if not self.as_json:
-                echo(f"picture: {', '.join(map(str, paths))}")
-        fins = [
-            (getattr(result, "fin_amplitude", None) or 0.0, point.label())
-            for point in points
-            if (result := folder.results.get(folder.key(point)))
-        ]
-        if fins:
-            largest, label = max(fins)
-            warn_of_fin(largest, f" at {label}")
-        if ending.is_interrupted:
-            done = sum(folder.key(point) in folder.results for point in points)
-            return ending.interrupted(f"{done} of {format_count(len(points), 'point')} are kept")
-        return 1 if any(folder.results[folder.key(point)].failure for point in points) else 0
+    run.show([curves.best_to_builtins(best, quantity) for _, best in bests], print_bests)
+    if any(curve.peak for curve in all_curves):
+        error_of = "the measurement" if run.fish.on == "live" else "the mean over beats"
+        paths = run.pictures(quantity.name)
+        figure.draw(paths, all_curves, units, error_of=error_of, quantity=quantity)
+        run.echo_pictures(paths)
+    fins = [
+        (getattr(result, "fin_amplitude", None) or 0.0, point.label())
+        for point in points
+        if (result := folder.results.get(folder.key(point)))
+    ]
+    if fins:
+        largest, label = max(fins)
+        warn_of_fin(largest, f" at {label}")
 
 
 def _echo_grid_errors(folder: "SweepFolder", points: "list[Point]") -> None:

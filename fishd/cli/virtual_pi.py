@@ -13,11 +13,11 @@ from click.shell_completion import CompletionItem
 from fishd.cli.config import fish_options
 from fishd.cli.options import for_option, json_option
 from fishd.cli.output import echo, echo_rows, print_json
+from fishd.cli.prompts import caught_signals
 from fishd.config import Config, load
 from fishd.core.addresses import virtual_pi_socket
 from fishd.core.console import complain
 from fishd.core.process import realtime
-from fishd.core.process.interruption import caught_signals
 from fishd.hardware.settings import PanelSettings
 from fishd.virtual.pi.faults import FAULTS
 from fishd.virtual.pi.link import RemotePi
@@ -168,7 +168,7 @@ def _format_line(state: PiState) -> str:
 
 
 def _format_pulses(state: PiState) -> str:
-    return "none" if state.angle is None else f"{state.pulse:.0f} µs, {state.angle:+.3f} rad"
+    return "none" if state.phi_c is None else f"{state.pulse:.0f} µs, {state.phi_c:+.3f} rad"
 
 
 def _format_faults(state: PiState) -> str:

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from fishd.cli.output import format_controller, format_quantities, format_time_of_day
 from fishd.core import text
-from fishd.core.console import format_power, format_thrust
+from fishd.core.console import format_readings, format_thrust
 from fishd.core.robots import find_kind
 from fishd.core.signals import Event, Status, Tick
 
@@ -90,7 +90,7 @@ class View:
         if holder := self.status.lease:
             header.append(_cut_line(text.line(f"held by {holder}, for {holder.age:.0f} s")))
         yield from header
-        quantities = self._quantity_lines()
+        quantities = self._value_lines()
         yield self._figure_table()
         yield from quantities
         events = max(0, min(3, (height - 14) // 3))
@@ -126,11 +126,10 @@ class View:
             thrust=tick.thrust,
             thrust_ci95=None if tick.thrust_ci95 is UNSET else tick.thrust_ci95,
         )
-        speed, power = tick.speed, self.status.power
+        speed = tick.speed
         figures = {
             **({"speed": f"{speed * 1e3:.1f} mm/s"} if isinstance(speed, float) else {}),
             "thrust": format_thrust(current),
-            **({} if power is None else {"power": format_power(power)}),
             "tail beat": f"{tick.frequency:.2f} Hz",
             **(self._timing_figures() if find_kind(self.status.robot).is_real_time else {}),
             "lost": f"{self._lost}",
@@ -150,15 +149,19 @@ class View:
             "skipped": f"{self._ticks[-1].missed_slots}",
         }
 
-    def _quantity_lines(self) -> list[Text]:
-        """Return the quantities of the controller in one line; no line if it has none."""
+    def _value_lines(self) -> list[Text]:
+        """Return the readings in a line, and the quantities of the controller in another one."""
         now = self._ticks[-1].quantities
-        if not isinstance(now, dict):
-            return []
-        parts: list[str | tuple[str, str]] = []
-        for name, value in format_quantities(now, self.status.quantity_units):
-            parts += [(f"{name} ", "dim"), (f"{value}   ", "bold")]
-        return [_cut_line(*parts)]
+        quantities = now if isinstance(now, dict) else {}
+        lines = (
+            format_readings(self.status),
+            format_quantities(quantities, self.status.quantity_units),
+        )
+        return [
+            _cut_line(*(part for entry in line for part in _style_entry(*entry)))
+            for line in lines
+            if line
+        ]
 
     def _draw_trace(self, trace: Trace, width: int, rows: int) -> Text:
         """Return a trace with its name and scale to the left; lost ticks leave a gap."""
@@ -180,6 +183,10 @@ class View:
             f"{label:>{LABEL_COLUMNS}}┤{line}" for label, line in zip(labels, curve, strict=True)
         )
         return Text("\n".join(lines), trace.style, no_wrap=True)
+
+
+def _style_entry(name: str, value: str) -> tuple[tuple[str, str], ...]:
+    return (f"{name} ", "dim"), (f"{value}   ", "bold")
 
 
 def _cut_line(*parts: str | tuple[str, str]) -> Text:

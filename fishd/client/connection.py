@@ -46,9 +46,6 @@ DEFAULT_IDLE_LIMIT_S = 30.0
 LATE_ANSWER_WAIT_MS = 500
 """Additional time to read an answer that is late: if this process was itself suspended, such as by
 SIGSTOP, the answer has arrived, but no thread has read it yet [ms]."""
-MAX_UNANSWERED_S = 1.0
-"""Time from a request to the end of its TCP connection if nothing is answered: a router may have
-forgotten it, and the next request connects again [s]."""
 ESTOP_FALLBACK_DELAY_S = 0.1
 """Time after which an emergency stop is also sent to fishd's emergency socket [s]."""
 ESTOP_SOCKET_TIMEOUT_S = 0.4

@@ -88,7 +88,7 @@ class KeyedRequestSocket(Requests):
 
     def interrupt(self) -> None:
         """End the wait of another thread, whose request then raises `FishError`."""
-        self._interrupted = True
+        self.is_interrupted = True
         os.eventfd_write(self._wake, 1)
 
     def _handle(self, event: int, _: int) -> None:

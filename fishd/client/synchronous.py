@@ -2,7 +2,6 @@
 
 import math
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from functools import partial
@@ -15,11 +14,10 @@ from fishd.client.connection import (
     DEFAULT_TIMEOUT_S,
     ESTOP_FALLBACK_DELAY_S,
     LATE_ANSWER_WAIT_MS,
-    MAX_UNANSWERED_S,
     Connection,
     answer_deadlines,
 )
-from fishd.client.request_socket import Requests, RequestSocket
+from fishd.client.request_socket import MAX_UNANSWERED_S, Requester, Requests, RequestSocket
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, LeaseLost, NoDaemon, NoKey, Refused, Untrusted
@@ -65,9 +63,7 @@ class Fish(Connection):
         access: keys for this endpoint, None for none; read from their folder by default
         """
         super().__init__(endpoint, timeout, telemetry, access)
-        self._socket: Requests | None = None
-        self._asked = 0.0
-        """Time of the first request since the latest answer [s, monotonic]; 0 without one."""
+        self._requester = Requester(self._open_socket, forgettable=not self._path)
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         """ZeroMQ context of telemetry, created by the first subscription."""
 
@@ -79,22 +75,15 @@ class Fish(Connection):
 
     def interrupt(self) -> None:
         """End the request of another thread, which then raises `FishError`."""
-        if self._socket:
-            self._socket.interrupt()
+        self._requester.interrupt()
 
     def close(self) -> None:
         """Disconnect; may be called twice."""
         if self.held:
             self.held.stop()
-        self._disconnect()
+        self._requester.disconnect()
         if self._context:
             self._context.destroy(linger=0)
-
-    def _disconnect(self) -> None:
-        """Close the connection of requests; the next request opens another one."""
-        if self._socket:
-            self._socket.close()
-        self._socket, self._asked = None, 0.0
 
     def status(self, timeout: float | None = None) -> Status:
         """Return a snapshot of the daemon.
@@ -308,38 +297,26 @@ class Fish(Connection):
         try:
             return self._exchange(kind, op, patience, args)
         except NoKey:  # the next request connects again
-            self._disconnect()
+            self._requester.disconnect()
             raise
 
     def _exchange(self, kind: type[T], op: str, patience: float, args: dict[str, Any]) -> T:
-        if self._socket is None:
-            self.check_endpoint()
-            self._socket = self._open_socket()
-        connection = self._socket
         identity, request = self.request(op, args)
-        sent_on = None
-        self._asked = self._asked or time.monotonic()
-        for deadline in answer_deadlines(self.timeout + patience, again=patience >= 0.0):
-            while sent_on is not None or connection.send_by(deadline, request):
-                sent_on = sent_on or connection.connections
-                reply = connection.receive_by(deadline, sent_on)
-                if reply:
-                    self._asked = 0.0
-                    result = self.result((reply,), identity, kind)
-                    if result is not None:
-                        return result
-                elif connection.is_connected(sent_on):
-                    break
-                elif op in READ_OPERATIONS:
-                    sent_on = None
-                else:
-                    self._asked = 0.0
-                    raise self.lost_command_error(op)
-        if not self._path and time.monotonic() - self._asked >= MAX_UNANSWERED_S:
-            self._disconnect()  # a router may have forgotten it
-        raise self.no_answer_error(patience)
+        deadlines = answer_deadlines(self.timeout + patience, again=patience >= 0.0)
+
+        def read(reply: bytes) -> T | None:
+            return self.result((reply,), identity, kind)
+
+        try:
+            result = self._requester.exchange(request, read, deadlines, op in READ_OPERATIONS)
+        except ConnectionResetError:
+            raise self.lost_command_error(op) from None
+        if result is None:
+            raise self.no_answer_error(patience)
+        return result
 
     def _open_socket(self) -> Requests:
+        self.check_endpoint()
         if not self.access:
             return RequestSocket(self.endpoint)
         from fishd.client.keyed_socket import KeyedRequestSocket
@@ -392,7 +369,7 @@ class Fish(Connection):
             except NoDaemon:
                 if self._path:
                     break
-                self._disconnect()  # a router may have forgotten this connection, too
+                self._requester.disconnect()  # a router may have forgotten this connection, too
             else:
                 return self.telemetry_address or status.telemetry
         return ""

@@ -29,12 +29,15 @@ from fishd.config.consistency import (
 )
 from fishd.config.drivers import (
     CHOICES,
+    SENSOR_SECTIONS,
     DriverSettings,
     check_drivers,
     check_plant,
+    check_readings,
     claims_of,
     convert_driver_sections,
     driver_keys,
+    readings_of,
     settings_of_drivers,
 )
 from fishd.controllers import registry
@@ -48,6 +51,7 @@ from fishd.core.protocol import DEFAULT_LEASE_S, MAX_LEASE_S, MIN_LEASE_S
 from fishd.core.robots import RobotKind, find_kind
 from fishd.core.schema import (
     Problem,
+    Reading,
     convert,
     drop_empty_sections,
     fields_of,
@@ -57,17 +61,19 @@ from fishd.core.schema import (
     unit,
 )
 from fishd.hardware.force_sensor.ads1115 import Ads1115Settings
+from fishd.hardware.registry import SENSORS
 from fishd.hardware.servo.pigpio import PigpioSettings
 from fishd.hardware.settings import (
+    POWER,
     ForceSensorSettings,
     PanelSettings,
-    PowerMeterSettings,
+    SensorSettings,
     ServoSettings,
 )
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.plant.drive_train import shortest_dwell
-from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.parameters import TETHERED, PlantParameters
 from fishd.virtual.swimmer.settings import SwimmerSettings
 
 log = logging.getLogger(__name__)
@@ -140,8 +146,8 @@ class ControlSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "s",
-            "Time after which an experiment that does not renew its lease ends, and the fish fades "
-            "to neutral; use a longer time for slow links.",
+            "Time after which an experiment that does not renew its lease ends; longer for slow "
+            "links.",
             ge=MIN_LEASE_S,
             le=MAX_LEASE_S,
         ),
@@ -174,13 +180,6 @@ class RealtimeSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             le=99,
         ),
     ] = 50
-    warm_up: Annotated[
-        bool,
-        note(
-            "Run mock ticks just before each real tick, so that it has warm caches; has no effect "
-            "for ticks below 10 ms."
-        ),
-    ] = True
     lock_memory: Annotated[bool, note("Keep fishd's memory from being paged out.")] = True
 
 
@@ -195,8 +194,8 @@ class Config(LoopSettings, frozen=True, forbid_unknown_fields=True, kw_only=True
         str,
         note(
             "Robot: simulated, a fish on its rod; pi, the robot on this Raspberry Pi; virtual-pi, "
-            "a simulated fish behind the robot's own drivers (fishctl virtual-pi); swimmer, a fish "
-            "that swims freely in a two-dimensional fluid; or one of another package."
+            "a simulated fish behind the robot's drivers; swimmer, a fish that swims freely; or "
+            "one of another package."
         ),
     ] = "simulated"
     robot_settings: Annotated[dict[str, Any], note("Settings of a robot of another package.")] = (
@@ -229,13 +228,10 @@ class Config(LoopSettings, frozen=True, forbid_unknown_fields=True, kw_only=True
     servo: Annotated[ServoSettings, note("The tail servo; not for a simulated fish.")] = (
         PigpioSettings(driver="pigpio")
     )
-    power_meter: Annotated[
-        PowerMeterSettings | None,
-        note(
-            "The power meter of the servo; null if the robot has none. Not for a simulated fish, "
-            "whose servo has a model."
-        ),
-    ] = None
+    sensors: Annotated[
+        Mapping[str, SensorSettings],
+        note("Any number of other sensors, each a named section."),
+    ] = {}
     panel: Annotated[
         PanelSettings, note("E-stop button and status light, if the robot has them.")
     ] = PanelSettings()
@@ -267,7 +263,16 @@ class Config(LoopSettings, frozen=True, forbid_unknown_fields=True, kw_only=True
     @property
     def driver_settings(self) -> DriverSettings:
         """Settings of the drivers."""
-        return DriverSettings(self.force_sensor, self.servo, self.power_meter)
+        return DriverSettings(self.force_sensor, self.servo, self.sensors)
+
+    @property
+    def readings(self) -> dict[str, Reading]:
+        """Readings of all sensors by name."""
+        has_model = not self.kind.has_hardware and self.kind.is_tethered
+        readings = {"power": POWER} if has_model and self.plant.model == TETHERED else {}
+        for settings in self.sensors.values():
+            readings |= readings_of(settings)
+        return readings
 
     @property
     def limits(self) -> Limits:
@@ -283,6 +288,7 @@ class Config(LoopSettings, frozen=True, forbid_unknown_fields=True, kw_only=True
             thrust_coefficient=(
                 self.plant.thrust_coefficient if self.estimator.kind == "observer" else None
             ),
+            readings=tuple(self.readings),
         )
 
     @property
@@ -363,6 +369,7 @@ Check = Callable[[Config], None]
 
 CHECKS: tuple[Check, ...] = (
     lambda c: check_robot(c.robot, c.robot_settings),
+    lambda c: check_readings(c.sensors),
     lambda c: check_start(c.start.controller, c.start.parameters, c.limits),
     lambda c: check_addresses(c.telemetry.address, c.control.address),
     lambda c: (
@@ -391,11 +398,23 @@ def adopt(data: dict[str, Any], overrides: Iterable[str] = ()) -> Config:
     The checks across fields are not repeated, as fishd has done them. Raises `ConfigError`.
     """
     sources = apply_overrides(data, overrides)
+    data = {**data, SENSOR_SECTIONS: _known_sensors(data.get(SENSOR_SECTIONS))}
     try:
         return convert_sections(data)
     except Problem as problem:
         place = sources.get(problem.path, "the configuration of the running fishd")
         raise ConfigError(problem.message_with_place({problem.path: place})) from None
+
+
+def _known_sensors(sensors: Any) -> Any:
+    """Return sections of sensors without those whose kind is not installed on this machine."""
+    if not isinstance(sensors, Mapping):
+        return sensors
+    return {
+        name: section
+        for name, section in sensors.items()
+        if not isinstance(section, Mapping) or SENSORS.has(str(section.get("kind")))
+    }
 
 
 def convert_sections(data: Mapping[str, Any]) -> Config:
@@ -429,5 +448,11 @@ def json_schema() -> dict[str, Any]:
             parts[struct.__name__]["properties"][CHOICES[section].key] = {"enum": names}
             refs.append({"$ref": f"#/$defs/{struct.__name__}"})
         default = {key: value for key, value in properties[section].items() if key == "default"}
-        properties[section] = {"anyOf": refs, **default}
+        choice = {"anyOf": refs, **default}
+        if section == SENSOR_SECTIONS:
+            choice = {
+                "type": "object",
+                "additionalProperties": {"anyOf": [*refs, {"type": "null"}]},
+            }
+        properties[section] = choice
     return {**top, "$defs": parts}

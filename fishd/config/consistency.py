@@ -164,7 +164,7 @@ def check_pins(claims: Mapping[str, Iterable[Claim]], panel: PanelSettings) -> N
     for section, key, pin, what, user in uses:
         first_what, first_user = users.setdefault(pin, (what, user))
         if first_what != what:  # otherwise two drivers share a bus
-            raise Problem((section, key), f"GPIO {pin} is already used by {first_user}")
+            raise Problem((*section.split("."), key), f"GPIO {pin} is already used by {first_user}")
 
 
 def check_i2c_addresses(settings: Mapping[str, Any]) -> None:
@@ -176,7 +176,7 @@ def check_i2c_addresses(settings: Mapping[str, Any]) -> None:
             first_section = sections.setdefault((bus, address), section)
             if first_section != section:
                 raise Problem(
-                    (section, "address"),
+                    (*section.split("."), "address"),
                     f"{address:#04x} on /dev/i2c-{bus} is already the address of {first_section}: "
                     "each chip needs a different address",
                 )

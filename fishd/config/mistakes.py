@@ -11,7 +11,7 @@ from typing import Any
 
 from fishd.config import configuration
 from fishd.config.configuration import Config
-from fishd.config.drivers import CHOICES
+from fishd.config.drivers import CHOICES, SENSOR_SECTIONS
 from fishd.core.errors import ConfigError
 from fishd.core.overrides import apply_overrides
 from fishd.core.schema import Problem, drop_empty_sections
@@ -71,8 +71,10 @@ class _MistakeSearch:
 
     def _leave_out(self, path: tuple[str, ...]) -> bool:
         """Remove a key, or the nearest section around it; return whether there was one."""
-        if path[1:] and CHOICES.get(path[0]) and path[1] == CHOICES[path[0]].key:
-            path = path[:1]  # the other keys are those of another driver
+        choice = CHOICES.get(path[0]) if path else None
+        length = 2 if path[:1] == (SENSOR_SECTIONS,) else 1
+        if choice and path[length:] == (choice.key,):
+            path = path[:length]  # the other keys are those of another driver
         for length in range(len(path), 0, -1):
             section: Any = self._data
             for key in path[: length - 1]:

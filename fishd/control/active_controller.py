@@ -91,10 +91,6 @@ class ActiveController:
         self.wave = _wave_kind(self.name, self.controller, self.parameters)
         self._reporter.controller("parameters", self.name, self.parameters, self.parameter_units)
 
-    def warm_up(self) -> None:
-        """Warm the controller up for the imminent update; raises what the controller raises."""
-        call_foreign(self.controller.warm_up)
-
 
 @lru_cache(maxsize=64)
 def _quantity_units(controller: type[Controller[Any]]) -> dict[str, str]:
@@ -131,7 +127,7 @@ def _wave_kind(
     name: str, controller: Controller[Any], parameters: dict[str, Any]
 ) -> tuple[str, dict[str, Any]]:
     """Return a value that is equal for waves of one kind, whatever their size."""
-    likeness = type(controller).swims_like
+    likeness = type(controller).same_wave_as
     if not isinstance(likeness, Likeness):
         return name, parameters
     return likeness.name, {

@@ -7,7 +7,7 @@ from fishd.core.foreign_code import call_foreign, real_number
 
 
 class Guard:
-    """A limiter of the instruction angle without a memory of its own, so nothing can wind up."""
+    """A limiter of the instruction angle without a memory, so nothing can wind up."""
 
     def __init__(
         self, amplitude: float, tick: float, slew_limit: float | None, fade_time: float
@@ -42,14 +42,16 @@ class Guard:
         Raises ValueError when `chosen` is not a number, or not finite.
         """
         is_float = type(chosen) is float
-        angle = chosen if is_float else call_foreign(real_number, chosen, "the instruction angle")
-        if not math.isfinite(angle):
-            raise ValueError(f"the instruction angle is {angle}, not a finite number")
-        if angle > self.highest:
-            angle = self.highest
-        elif angle < self.lowest:
-            angle = self.lowest
-        return _step_towards(angle, previous, self.step)
+        permitted = (
+            chosen if is_float else call_foreign(real_number, chosen, "the instruction angle")
+        )
+        if not math.isfinite(permitted):
+            raise ValueError(f"the instruction angle is {permitted}, not a finite number")
+        if permitted > self.highest:
+            permitted = self.highest
+        elif permitted < self.lowest:
+            permitted = self.lowest
+        return _step_towards(permitted, previous, self.step)
 
     def fade(self, previous: float) -> float:
         """Return the next instruction angle on the way to neutral [rad]."""

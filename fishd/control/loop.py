@@ -19,8 +19,9 @@ from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.guard import Guard
 from fishd.control.lease import Lease
 from fishd.control.perception import Perception
+from fishd.control.readings import Readings
 from fishd.control.reporting import Reporter
-from fishd.control.servo import ServoOutput, ServoPower
+from fishd.control.servo import ServoOutput
 from fishd.control.statistics import Statistics
 from fishd.control.supervisor import Mode, Supervisor
 from fishd.controllers.base import Controller, Limits
@@ -50,8 +51,6 @@ class TickInputs(Struct, frozen=True, gc=False):
     observation: Observation
     marks: tuple[float, float, float]
     """Times at the start of the tick, after the read and after the estimate [s, monotonic]."""
-    power: float | None
-    """Mean electrical power of the servo since the previous tick [W]; None where it is unknown."""
 
 
 class ControlLoop:
@@ -84,7 +83,9 @@ class ControlLoop:
         self.active = ActiveController(limits, self.reporter)
         self.lease = Lease(clock.monotonic)
         self.servo = ServoOutput(robot, clock.monotonic)
-        self.power = ServoPower(robot, self.reporter, settings.tick)
+        self.readings = Readings(
+            robot.sensors, self.reporter, self.supervisor, settings.tick, clock.monotonic()
+        )
         self.seq = 0
         """Sequence number of the latest tick."""
         self.instruction_angle = 0.0
@@ -136,10 +137,12 @@ class ControlLoop:
         if self.lease.active:
             self.expire_lease()
         measurement = self.perception.read(slot)
-        power = self.power.read(slot.deadline) if self.power.metered else None
+        readings = self.readings.read(slot.deadline) if self.readings.sensors else None
         read = self._now()
-        observation = self.perception.observe(measurement, slot, dt, self.instruction_angle)
-        return TickInputs(slot, measurement, observation, (started, read, self._now()), power)
+        observation = self.perception.observe(
+            measurement, slot, dt, self.instruction_angle, readings
+        )
+        return TickInputs(slot, measurement, observation, (started, read, self._now()))
 
     def act(self, inputs: TickInputs) -> None:
         """Run the second half of a tick: let the controller choose, drive the servo, publish."""
@@ -163,14 +166,6 @@ class ControlLoop:
             self.supervisor.note_overrun(self.seq)
         if self._notify:
             self._notify(started)
-
-    def warm_up(self) -> None:
-        """Warm the active controller and the robot up for the imminent tick."""
-        self.robot.prepare()
-        try:
-            self.active.warm_up()
-        except Exception as error:
-            self._fail("controller-error", f"controller {self.active.name} failed", error)
 
     def set_controller(self, name: str, controller: Controller[Any]) -> None:
         """Make a controller the active one, from the next tick on.
@@ -361,8 +356,8 @@ class ControlLoop:
         """
         slot, measurement = inputs.slot, inputs.measurement
         parts = self.perception.telemetry(measurement, inputs.observation)
-        if inputs.power is not None:
-            parts["power"] = inputs.power
+        if readings := inputs.observation.readings:
+            parts["readings"] = readings
         if quantities := self.active.quantities:
             parts["quantities"] = quantities
         if self.robot.truth:

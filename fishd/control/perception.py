@@ -94,12 +94,18 @@ class Perception:
         return measurement
 
     def observe(
-        self, measurement: Measurement, slot: Slot, dt: float, instruction_angle: float
+        self,
+        measurement: Measurement,
+        slot: Slot,
+        dt: float,
+        instruction_angle: float,
+        readings: dict[str, float] | None = None,
     ) -> Observation:
         """Return the observation of a tick.
 
         dt: time since the previous tick [s]
         instruction_angle: the one that was sent in the previous tick [rad]
+        readings: those of the other sensors, by name
         """
         suspect = bool(measurement.suspect)
         trusted = self._last_trusted_measurement() if suspect else measurement
@@ -109,6 +115,8 @@ class Perception:
             observation = self._follow_thrust(observation, suspect)
             if self._tethered:
                 self._watch_sign(observation, measurement.fy, suspect)
+        if readings:
+            observation = replace(observation, readings=readings)
         self.observation = observation
         return observation
 

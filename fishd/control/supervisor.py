@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from enum import StrEnum
 
-from fishd.control.faults import FAULTS, UNLISTED, Effect
+from fishd.control.faults import FAULTS, UNLISTED
 from fishd.core import text
 from fishd.core.errors import Refused
 from fishd.core.signals import Reason
@@ -83,7 +83,7 @@ class Supervisor:
         code: a key of FAULTS, or a code of a controller from another package
         """
         fault = FAULTS.get(code, UNLISTED)
-        mode = Mode.ESTOP if fault.effect is Effect.RELEASE else Mode.FAULT
+        mode = Mode.ESTOP if fault.releases else Mode.FAULT
         if self.reason is None or (mode is Mode.ESTOP and self.mode is Mode.FAULT):
             self._enter(mode, Reason(text.quoted(code), text.line(message), fault.remedy))
 
@@ -95,7 +95,7 @@ class Supervisor:
         problem: what failed; None if the check passed
         """
         limit = FAULTS[code].in_a_row
-        if problem is None:
+        if not problem:
             self.failures.pop(code, None)
             return
         self.failures[code] = count = self.failures.get(code, 0) + 1

@@ -50,7 +50,7 @@ class Limits(Struct, frozen=True):
     """Limits of the loop for a controller."""
 
     amplitude: float
-    """Φ: commands beyond ±Φ are clamped by the guard [rad]."""
+    """Φ: angles beyond ±Φ are clamped by the guard [rad]."""
     tick: float
     """Period of the loop [s]."""
     scaled: bool = False
@@ -64,6 +64,8 @@ class Limits(Struct, frozen=True):
     """Settings for a policy that reverses too fast; `dwell` above is the effective one."""
     tethered: bool = True
     """Whether the fish hangs from its force sensor, so that F_x is its thrust."""
+    readings: tuple[str, ...] | None = None
+    """Names of the readings of the sensors, which `Observation.readings` has; None if unknown."""
     thrust_coefficient: float | None = None
     """K of the observer's model of the fish: ratio of thrust to the mean square of the fin velocity
     [N s²/rad²]; None if the fin velocity is not from a model."""
@@ -91,11 +93,11 @@ class Controller(ABC, Generic[P]):
     """
 
     Parameters: ClassVar[type[Struct]]
-    swims_like: ClassVar[Likeness | None] = None
+    same_wave_as: ClassVar[Likeness | None] = None
     """The other controller whose known thrust applies to the wave of this one, too."""
 
     uses_lateral_force: ClassVar[bool] = True
-    """False if the commands depend neither on F_y nor on the fin velocity: then the controller may
+    """False if its angles depend neither on F_y nor on the fin velocity: then the controller may
     start although F_y is reversed and `estimator.reversed_fy` is refuse."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -131,12 +133,6 @@ class Controller(ABC, Generic[P]):
     def retune(self, parameters: P) -> None:
         """Apply new, already checked parameters while active; called between two updates."""
         self.parameters = parameters
-
-    def warm_up(self) -> None:
-        """Do the computation of `update` without an effect, to warm the caches for it.
-
-        Called up to once per tick, just before it; only for work that is slow with cold caches.
-        """
 
     def close(self) -> None:
         """Release all resources: called once, when the controller is no longer used."""

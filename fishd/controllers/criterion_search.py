@@ -88,7 +88,7 @@ rung and the other side the other: with few ticks per half beat, the optimum may
 
 
 class Judgement(NamedTuple):
-    """Measurement of some beats by the force."""
+    """Measurement of several beats by the force."""
 
     ripple: float
     """Ripple of F_x, rms [N]."""
@@ -193,7 +193,7 @@ class CriterionSearch:
 
         fx, fy: mean forces since the previous tick [N]
         dt: time since then [s]
-        side: sign of the command since then
+        side: sign of the instruction angle since then
         """
         self._watched += dt
         if side != self._side:

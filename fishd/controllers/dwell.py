@@ -1,6 +1,6 @@
 """Dwell: a minimum time between reversals, with a fault for policies that keep violating it.
 
-It applies to the commands of `ppo`, `remote` and of trainings, but not to `swing` and the
+It applies to `ppo`, `remote` and of trainings, but not to `swing` and the
 waveforms.
 """
 
@@ -20,10 +20,10 @@ _ROUNDING_TICKS = 1e-3  # a sum of ticks is not exact
 
 
 class Dwell:
-    """Limit of a command: at least the dwell must pass between two changes of its side.
+    """Limit of the instruction angle: the dwell must pass between two changes of its side.
 
-    Within a side, the command is free. A reversal that is held back keeps the previous angle, or
-    goes to neutral if the command is neutral.
+    Within a side, the angle is free. A reversal that is held back keeps the previous angle, or
+    goes to neutral if the new one is neutral.
     """
 
     def __init__(self, dwell: float, tick: float, amplitude: float) -> None:
@@ -37,32 +37,32 @@ class Dwell:
         """Whether a reversal was held back in the latest tick."""
         self._tick = tick
         self._resting = NEUTRAL_FRACTION * amplitude
-        self._angle = 0.0
+        self._instruction_angle = 0.0
         self._side = 0.0
         self._elapsed = 0.0
         """Time since the last reversal [s]."""
 
-    def activate(self, angle: float) -> None:
+    def activate(self, instruction_angle: float) -> None:
         """Begin at the current angle [rad], as if the tail had just reversed."""
-        self._angle = angle
-        self._side = math.copysign(1.0, angle) if angle else 0.0
+        self._instruction_angle = instruction_angle
+        self._side = math.copysign(1.0, instruction_angle) if instruction_angle else 0.0
         self._elapsed = 0.0
 
-    def apply(self, angle: float, dt: float) -> float:
-        """Return the angle to command [rad], `dt` [s] after the previous one."""
+    def apply(self, instruction_angle: float, dt: float) -> float:
+        """Return the angle to send [rad], `dt` [s] after the previous one."""
         self._elapsed += dt
         self.held = False
-        if not (self.dwell and math.isfinite(angle)):
-            return angle
-        side = math.copysign(1.0, angle) if angle else self._side
+        if not (self.dwell and math.isfinite(instruction_angle)):
+            return instruction_angle
+        side = math.copysign(1.0, instruction_angle) if instruction_angle else self._side
         if side != self._side:
             if self._side and self._elapsed < self.dwell - _ROUNDING_TICKS * self._tick:
-                self.held = abs(angle) > self._resting
-                angle = self._angle if self.held else 0.0
+                self.held = abs(instruction_angle) > self._resting
+                instruction_angle = self._instruction_angle if self.held else 0.0
             else:
                 self._side, self._elapsed = side, 0.0
-        self._angle = angle
-        return angle
+        self._instruction_angle = instruction_angle
+        return instruction_angle
 
 
 class DwellLimit(Dwell):
@@ -89,16 +89,16 @@ class DwellLimit(Dwell):
         """Fraction of the latest ticks, over the patience, in which a reversal was held back."""
         return self._count / self._patience
 
-    def apply(self, angle: float, dt: float) -> float:
-        """Return the angle to command [rad], like `Dwell.apply`.
+    def apply(self, instruction_angle: float, dt: float) -> float:
+        """Return the angle to send [rad], like `Dwell.apply`.
 
         Raise `ControllerFault` with the code `chatter`, and a successor if configured, once
         reversals were held back for too long.
         """
-        angle = super().apply(angle, dt)
-        if self.dwell and math.isfinite(angle):
+        instruction_angle = super().apply(instruction_angle, dt)
+        if self.dwell and math.isfinite(instruction_angle):
             self._watch(self.held)
-        return angle
+        return instruction_angle
 
     def _watch(self, held: bool) -> None:
         self._held.append(held)

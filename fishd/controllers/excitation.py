@@ -1,4 +1,4 @@
-"""`excitation`: a command for the identification of a fish."""
+"""`excitation`: instruction angles for the identification of a fish."""
 
 from typing import Annotated, Any
 

@@ -33,10 +33,10 @@ class Reversal:
         ticks = max(1, round(SLOPE_WINDOW_S / limits.tick))
         self._velocities: deque[float] = deque(maxlen=ticks + 1)
 
-    def begin(self, angle: float) -> None:
+    def begin(self, instruction_angle: float) -> None:
         """Push towards the side of this angle; from 0, towards plus."""
-        self.direction = 1.0 if angle >= 0 else -1.0
-        self._first = angle == 0.0
+        self.direction = 1.0 if instruction_angle >= 0 else -1.0
+        self._first = instruction_angle == 0.0
 
     def update(self, observation: Observation, C: float, lead: float, longest: float) -> None:
         """Process a tick.

@@ -67,7 +67,7 @@ class Swing(Controller[SwingParameters]):
 
     Parameters = SwingParameters
     # A lead changes only the size of the wave; `thrust`, which has none, has the same wave.
-    swims_like: ClassVar[Likeness | None] = Likeness("swing", frozenset({"lead"}))
+    same_wave_as: ClassVar[Likeness | None] = Likeness("swing", frozenset({"lead"}))
     top_speed: float = quantity(
         "1", "Top speed of the fin in this half beat, or, until it is reached, in the previous one."
     )

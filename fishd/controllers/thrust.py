@@ -71,7 +71,7 @@ class Thrust(Controller[ThrustParameters]):
     """
 
     Parameters = ThrustParameters
-    swims_like: ClassVar[Likeness | None] = Likeness("swing", frozenset({"target"}))
+    same_wave_as: ClassVar[Likeness | None] = Likeness("swing", frozenset({"target"}))
     amplitude: float = quantity("rad", "Current amplitude.")
     held_thrust: float | None = quantity(
         "N", "Thrust of the latest beats, as used by the controller."

@@ -1,4 +1,4 @@
-"""`square`, `sine` and `triangle`: periodic commands of a given frequency and amplitude.
+"""`square`, `sine` and `triangle`: periodic waves of a given frequency and amplitude.
 
 All keep their phase when the frequency changes. Sine and triangle start from the current angle.
 """
@@ -125,9 +125,9 @@ class Smooth(Waveform):
 
     def activate(self, observation: Observation) -> None:
         """Choose phase and excess so that the first angle is the current one."""
-        angle = observation.instruction_angle
-        self.phase = self.phase_of(max(-1.0, min(1.0, angle / self.amplitude)))
-        self._excess = angle - self.amplitude * self.shape(self.phase)
+        instruction_angle = observation.instruction_angle
+        self.phase = self.phase_of(max(-1.0, min(1.0, instruction_angle / self.amplitude)))
+        self._excess = instruction_angle - self.amplitude * self.shape(self.phase)
 
     def retune(self, parameters: WaveformParameters) -> None:
         """Keep the phase; add the jump that a new amplitude would cause to the excess."""

@@ -4,23 +4,27 @@ from collections.abc import Iterable
 
 
 class Reversals:
-    """Detector of the reversals of a command; an angle of 0 keeps the side of the previous one."""
+    """Detector of the reversals of the instruction angle; 0 keeps the previous side."""
 
     def __init__(self) -> None:
         self._side = 0.0
 
-    def add(self, angle: float) -> int:
+    def add(self, instruction_angle: float) -> int:
         """Return 1 for an upward reversal, −1 for a downward one, and 0 for none.
 
-        angle: the next instruction angle [rad]
+        instruction_angle: the next instruction angle [rad]
         """
         before = self._side
-        if angle:
-            self._side = 1.0 if angle > 0.0 else -1.0
+        if instruction_angle:
+            self._side = 1.0 if instruction_angle > 0.0 else -1.0
         return int(self._side) if before and self._side != before else 0
 
 
 def upward_reversals(angles: Iterable[float]) -> list[int]:
     """Return the indices of the angles with which a beat begins."""
     reversals = Reversals()
-    return [index for index, angle in enumerate(angles) if reversals.add(angle) > 0]
+    return [
+        index
+        for index, instruction_angle in enumerate(angles)
+        if reversals.add(instruction_angle) > 0
+    ]

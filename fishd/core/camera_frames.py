@@ -30,6 +30,24 @@ class Frame(NamedTuple):
     pixels: Pixels
 
 
+class FrameHead(Struct, frozen=True, gc=False):
+    """Metadata of a recorded frame, without its picture."""
+
+    t: Annotated[float, unit("s", "Middle of the exposure, unix.")]
+    time: Annotated[
+        float, unit("s", "Middle of the exposure on fishd's monotonic clock, as `time` of a tick.")
+    ]
+    available: Annotated[float, unit("s", "Time of arrival of the frame, on that clock.")]
+    seq: Annotated[int, note("Number of the frame in its session, from 1.")]
+    session: Annotated[str, note("Identifier of one run of the camera on one clock.")]
+    exposure: Annotated[
+        float | None, unit("s", "Duration of the exposure; omitted if unknown.")
+    ] = None
+    dropped_frames: Annotated[
+        int, note("Number of frames that the camera took but did not deliver, since its start.")
+    ] = 0
+
+
 class StackSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Settings of the frames that a policy with a camera gets in a tick; part of such a policy."""
 

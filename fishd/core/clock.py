@@ -9,7 +9,7 @@ import itertools
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
@@ -164,25 +164,24 @@ class Ticker:
 
     MARGIN_S = 2e-3
     """Time before the deadline at which other work stops, at most a quarter of the period [s]."""
+    EARLY_S = 6e-5
+    """Time before the deadline at which the last sleep ends, because a wake-up takes about as long
+    [s]; the rest is a busy-wait."""
 
-    def __init__(self, period: float, warm_up: Callable[[], None] | None = None) -> None:
+    def __init__(self, period: float) -> None:
         """Start the ticker inside a running asyncio loop; the first slot is two margins from now.
 
-        warm_up: called just before each deadline, if there is time for it
+        period: [s]
         """
         import asyncio  # slow to import: a tenth of the start of programs that use only the clocks
 
         self._period = period
-        self._warm_up = warm_up
         self._margin = min(self.MARGIN_S, period / 4)
-        self._warm_up_time = self._margin / 2
-        self._latest_warm_up = math.inf
-        """Duration of the latest warm-up [s]."""
         self._start = time.monotonic() + 2.0 * self._margin
         self._index = -1
         self._timer = TimerFd()
-        self._woken = asyncio.Event()
         self._loop = asyncio.get_running_loop()
+        self._woken = self._loop.create_future()
         self._loop.add_reader(self._timer, self._wake)
 
     def close(self) -> None:
@@ -197,39 +196,20 @@ class Ticker:
     async def __anext__(self) -> Slot:
         """Wait for the next slot, in which the caller must tick at once."""
         following = self._index + 1
-        self._woken.clear()
-        self._timer.arm(self._start + following * self._period - self._margin)
-        await self._woken.wait()
         deadline = self._start + following * self._period
-        if self._warm_up:
-            self._warm_up_before(deadline, self._warm_up)
-        self._sleep_until(deadline)
-        now = time.monotonic()
+        self._woken = self._loop.create_future()
+        self._timer.arm(deadline - self._margin)
+        await self._woken
+        remaining = deadline - time.monotonic() - self.EARLY_S
+        if remaining > 0.0:
+            time.sleep(remaining)
+        while (now := time.monotonic()) < deadline:
+            pass
         current = max(following, math.floor((now - self._start) / self._period))
         self._index = current
         return Slot(current, self._start + current * self._period, now, current - following)
 
     def _wake(self) -> None:
         self._timer.clear()
-        self._woken.set()
-
-    def _warm_up_before(self, deadline: float, warm_up: Callable[[], None]) -> None:
-        """Warm up as late as is safe, then busy-wait, since a sleep would lose the caches again."""
-        self._sleep_until(deadline - 2.0 * self._warm_up_time)
-        start = time.monotonic()
-        # Decay: one slow warm-up, on a busy machine, must not disable warm-ups permanently.
-        self._warm_up_time *= 0.98
-        if deadline - start > self._warm_up_time:
-            warm_up()
-            before, self._latest_warm_up = self._latest_warm_up, time.monotonic() - start
-            # A warm-up much slower than the previous one shows only that the machine was busy.
-            usual = min(before, self._latest_warm_up)
-            self._warm_up_time = max(self._warm_up_time, usual)
-            while time.monotonic() < deadline:
-                pass
-
-    @staticmethod
-    def _sleep_until(deadline: float) -> None:
-        remaining = deadline - time.monotonic()
-        if remaining > 0:
-            time.sleep(remaining)
+        if not self._woken.done():
+            self._woken.set_result(None)

@@ -13,7 +13,7 @@ from fishd.core import text
 from fishd.core.errors import ConfigError, FishdError
 
 if TYPE_CHECKING:  # imports msgspec, which help and most completions do not need
-    from fishd.core.signals import Status
+    from fishd.core.signals import ReadingState, Status
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells report it: 128 plus the number of SIGINT."""
@@ -33,7 +33,7 @@ log_format_option = click.option(
 
 
 def status_line(status: "Status") -> str:
-    """Return mode, controller, frequency, thrust, power, lateness and missed ticks in one line.
+    """Return mode, controller, frequency, thrust, readings, lateness and missed ticks in one line.
 
     A free fish has its current speed instead of a thrust. A servo that is not reached is mentioned.
     """
@@ -45,9 +45,9 @@ def status_line(status: "Status") -> str:
     result = f"thrust {format_thrust(status):>16}"
     if status.speed is not None:
         result = f"speed {status.speed * 1e3:6.1f} mm/s"
-    power = "" if status.power is None else f"  power {format_power(status.power):>8}"
+    readings = "".join(f"  {name} {value:>8}" for name, value in format_readings(status))
     return (
-        f"{what:<16} {status.frequency:5.2f} Hz  {result}{power}  "
+        f"{what:<16} {status.frequency:5.2f} Hz  {result}{readings}  "
         f"late p50 {status.timing.lateness.p50:4.0f} p99 {status.timing.lateness.p99:4.0f} µs  "
         f"missed {status.missed_slots} of {status.seq + status.missed_slots} ticks{servo}"
     )
@@ -64,6 +64,24 @@ def format_thrust(status: "Status") -> str:
     if status.thrust_ci95 is None:
         return f"{1e3 * status.thrust:.2f} ± ? {unit}"
     return text.format_measured(status.thrust, status.thrust_ci95, status.force_unit)
+
+
+def format_readings(status: "Status") -> list[tuple[str, str]]:
+    """Return the names of the readings, and their values with units; `–` for one that is old."""
+    return [
+        (text.quoted(name), "–" if reading.value is None else format_reading(reading))
+        for name, reading in status.readings.items()
+    ]
+
+
+def format_reading(reading: "ReadingState") -> str:
+    """Return a value that is not old with its unit: `21.25 °C`."""
+    assert reading.value is not None
+    if reading.unit == "W":
+        return format_power(reading.value)
+    from fishd.core import schema
+
+    return schema.format_reading(reading.value, text.quoted(reading.unit))
 
 
 def format_power(power: float) -> str:

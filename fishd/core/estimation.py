@@ -22,10 +22,10 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
     kind: Annotated[
         Literal["lateral_force", "observer", "sensor", "tail"],
         note(
-            "lateral_force integrates F_y and knows nothing of the fish; observer is a Kalman "
-            "filter on the fish of section plant, as fishctl identify finds it; sensor takes the "
-            "angular velocity of the tail against the front body, which a free fish measures; tail "
-            "takes the velocity of its tail across the laboratory, as the paper's swimmer does."
+            "lateral_force integrates F_y; observer is a Kalman filter on the fish of section "
+            "plant, as fishctl identify finds it; sensor takes the angular velocity of the tail "
+            "against the front body, which a free fish measures; tail takes the velocity of its "
+            "tail across the laboratory, as the paper's swimmer does."
         ),
     ] = "lateral_force"
     leak: Annotated[
@@ -81,9 +81,9 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
         Literal["correct", "refuse", "warn"],
         note(
             "Reaction to a first push of the tail that shows that F_y is reversed. correct: "
-            "estimator and controllers use F_y with the other sign, and status says so. refuse: "
-            "mode fault, and no controller that uses F_y starts until F_y or the servo is "
-            "calibrated. warn: status says so, and the fish swims badly."
+            "estimator and controllers use F_y with the other sign. refuse: mode fault, and no "
+            "controller that uses F_y starts until F_y or the servo is calibrated. warn: only "
+            "status says so."
         ),
     ] = "correct"
     sensor_rotation: Annotated[

@@ -11,7 +11,7 @@ import reprlib
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
-from typing import Any, TypeGuard, TypeVar, cast
+from typing import Annotated, Any, TypeGuard, TypeVar, cast
 
 import msgspec
 from msgspec import Meta, Struct, inspect
@@ -91,6 +91,19 @@ class Field(Struct, frozen=True, omit_defaults=True):
     """Largest magnitude that is reasonable on a real fish, if the bounds are wider; else 0."""
     step: float = 0.0
     """Step in which a page or a panel changes a number; 0 for none."""
+
+
+class Reading(Struct, frozen=True):
+    """Description of a quantity that a sensor reads."""
+
+    unit: Annotated[str, Meta(description="Unit in SI notation, or `°C`; `1` for a pure number.")]
+    description: Annotated[str, Meta(description="Description in one line.")]
+    low: Annotated[
+        float | None, Meta(description="Value below which a reading is doubtful; null for none.")
+    ] = None
+    high: Annotated[
+        float | None, Meta(description="Value above which it is doubtful; null for none.")
+    ] = None
 
 
 class Problem(Exception):
@@ -203,18 +216,28 @@ def schema_name(message: type[Struct]) -> str:
     return f"fishd.{message.__name__}"
 
 
-def json_schema(message: type[Struct]) -> bytes:
+def json_schema(message: type[Struct], readings: Mapping[str, Reading] | None = None) -> bytes:
     """Return the flat JSON Schema of a message, as Foxglove and its relatives need it.
 
     They take a root of type object, without `$ref` and `anyOf`: nested values are plain objects.
+
+    readings: readings of the sensors, which are described in the field `readings` of a tick
     """
     properties: dict[str, Any] = {}
     for field in fields_of(message):
-        description = f"{field.description} [{field.unit}]" if field.unit else field.description
-        kind = _JSON_TYPES.get(field.kind, "string")
-        properties[field.name] = {"type": kind, "description": description}
+        properties[field.name] = _json_property(field)
+    if readings and "readings" in properties:
+        properties["readings"]["properties"] = {
+            name: _json_property(Field(name, "number", each.unit, each.description, None, True))
+            for name, each in readings.items()
+        }
     title = schema_name(message)
     return msgspec.json.encode({"title": title, "type": "object", "properties": properties})
+
+
+def _json_property(field: Field) -> dict[str, Any]:
+    description = f"{field.description} [{field.unit}]" if field.unit else field.description
+    return {"type": _JSON_TYPES.get(field.kind, "string"), "description": description}
 
 
 def describe_permitted(field: Field) -> str:
@@ -536,6 +559,11 @@ def format_quantity(value: Any, symbol: str) -> str:
         return "default"
     number = f"{value:g}" if _is_number(value) and float(f"{value:g}") == value else str(value)
     return f"{number} {symbol}" if symbol not in ("", "1") and _is_number(value) else number
+
+
+def format_reading(value: float, symbol: str) -> str:
+    """Return a measured value with its unit, to four digits: `21.25 °C`."""
+    return f"{value:.4g} {'' if symbol == '1' else symbol}".rstrip()
 
 
 def format_values(values: Mapping[str, Any], units: Mapping[str, str], separator: str = " ") -> str:

@@ -5,11 +5,12 @@ unchanged over telemetry and the control channel, so their field names are the p
 The tables of docs/reference/protocol.md are generated from the declarations here (`make docs`).
 """
 
+import math
 from typing import Annotated, Any, Literal, Protocol, get_args
 
 from msgspec import UNSET, Struct, UnsetType
 
-from fishd.core.schema import Field, note, unit
+from fishd.core.schema import Field, Reading, note, unit
 
 MODES = "`idle`, `running`, `fault` or `estop`."
 
@@ -83,6 +84,8 @@ class Observation(Struct, frozen=True, gc=False):
     side_time: float = 0.0
     """Time since the instruction angle came to its side of neutral, with the sign of the angle; at
     most 2 s, and 0 at neutral [s]."""
+    readings: dict[str, float] = {}
+    """Readings of the sensors by name, such as `water_temperature`, without old ones."""
 
 
 class Course(Struct, frozen=True, gc=False):
@@ -120,7 +123,7 @@ class Tick(Struct, frozen=True, gc=False):
     t: Annotated[float, unit("s", "Time of the tick, unix.")]
     seq: Annotated[int, note("Number of the tick, from 1; a gap means lost messages.")]
     mode: Annotated[str, note(MODES)]
-    controller: Annotated[str, note("Name of the controller that chose the command.")]
+    controller: Annotated[str, note("Name of the controller that chose `phi_c`.")]
     fx: Annotated[float, unit("N", "Mean longitudinal force since the previous tick.")]
     fy: Annotated[float, unit("N", "Mean lateral force since the previous tick.")]
     fy_rate: Annotated[float, unit("N/s", "Rate of change of the lateral force.")]
@@ -209,12 +212,11 @@ class Tick(Struct, frozen=True, gc=False):
         float | UnsetType,
         unit("N", "Half-width of the 95 % confidence interval of `thrust_factor`."),
     ] = UNSET
-    power: Annotated[
-        float | UnsetType,
-        unit(
-            "W",
-            "Mean electrical power of the servo since the previous tick; absent without a readable "
-            "power meter.",
+    readings: Annotated[
+        dict[str, float] | UnsetType,
+        note(
+            "Readings of the sensors by name, without old ones; absent without sensors. `power` is "
+            "the electrical power of the servo [W]. Status has their units."
         ),
     ] = UNSET
     leak: Annotated[
@@ -249,6 +251,11 @@ class Tick(Struct, frozen=True, gc=False):
     ] = UNSET
 
 
+def reading_of(readings: dict[str, float] | UnsetType, name: str) -> float:
+    """Return a reading of a tick by its name; NaN if it is absent."""
+    return math.nan if readings is UNSET else readings.get(name, math.nan)
+
+
 Level = Literal["info", "warning", "error"]
 EventKind = Literal[
     "mode",
@@ -258,7 +265,7 @@ EventKind = Literal[
     "fault",
     "overrun",
     "servo",
-    "power",
+    "sensor",
     "calibration",
     "gateway",
     "sockets",
@@ -295,8 +302,8 @@ EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
         "empty",
     ),
     ("servo", "info", "the servo can be reached again", "empty"),
-    ("power", "warning", "the power meter cannot be read; the fish swims on", "empty"),
-    ("power", "info", "the power meter can be read again", "empty"),
+    ("sensor", "warning", "a sensor gives no readings, or a doubtful one", "`sensor`: its name"),
+    ("sensor", "info", "that sensor gives good readings again", "`sensor`: its name"),
     ("calibration", "info", "another calibration was saved and is used now", "`file`"),
     (
         "calibration",
@@ -319,8 +326,8 @@ EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
     (
         "gateway",
         "warning",
-        "the process behind a socket was restarted; messages were lost",
-        "`gateway`: `telemetry` or `control`",
+        "the process that has the sockets was restarted; messages were lost",
+        "`gateway`: `local`, or `network` for clients with a key",
     ),
     (
         "sockets",
@@ -439,6 +446,17 @@ class Publisher(Protocol):
         """Publish one event."""
 
 
+class ReadingState(Reading, frozen=True, kw_only=True):
+    """A reading of a sensor, with its description."""
+
+    sensor: Annotated[str, note("Name of its sensor in the configuration.")]
+    value: Annotated[
+        float | None, note("Mean over the last 2 s, in its unit; null while it is old or unknown.")
+    ]
+    age: Annotated[float | None, unit("s", "Age of its newest sample; null before the first one.")]
+    problem: Annotated[str | None, note("Reason why it is old or doubtful; null for neither.")]
+
+
 class Status(Struct, frozen=True):
     """Snapshot of the daemon; published on topic `status`, and the result of `status`.
 
@@ -509,9 +527,9 @@ class Status(Struct, frozen=True):
     ] = {}
     clock: Annotated[float, unit("s", "Time of the snapshot, on fishd's monotonic clock.")] = 0.0
     speed: Annotated[float | None, unit("m/s", "As in `tick`; null for a tethered fish.")] = None
-    power: Annotated[
-        float | None, unit("W", "Mean of `power` over the last 2 s; null if unknown.")
-    ] = None
+    readings: Annotated[
+        dict[str, ReadingState], note("[Readings](#readings) of the sensors by name.")
+    ] = {}
     boot_id: Annotated[
         str,
         note("Identifier of the boot of fishd's machine, from which its monotonic clock counts."),

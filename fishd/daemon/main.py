@@ -36,7 +36,6 @@ from fishd.daemon.gateway.gateways import Gateways, Telemetry
 from fishd.daemon.requests import Access, Operations
 from fishd.daemon.socket_files import SocketWatch
 from fishd.daemon.virtual_pace import Lockstep, SlowMotion
-from fishd.daemon.warm_up import mock_ticks
 from fishd.hardware.base import Robot
 from fishd.hardware.servo.pulses import NEUTRAL_TIME_S
 
@@ -85,8 +84,7 @@ class Daemon:
             self._gateways = Gateways(address, config.telemetry.address, stack, network)
             # Before the gateways end, after the servo is released.
             stack.callback(realtime.drop_priority)
-            self._telemetry = Telemetry(self._gateways.publish)
-            self._mock_ticks = None if self._virtual else mock_ticks(config)
+            self._telemetry = Telemetry(self._gateways)
             controllers = registry.describe_all()  # imports the controllers of other packages
             if not self._virtual:
                 preload()  # importing it later would delay ticks
@@ -169,7 +167,7 @@ class Daemon:
         clock, lockstep = self._clock, None
         if isinstance(clock, VirtualClock):
             lockstep = Lockstep(self._loop, clock, self._config.tick, self._slow)
-        ticker = lockstep or Ticker(self._config.tick, self._mock_ticks and self._warm_up)
+        ticker = lockstep or Ticker(self._config.tick)
 
         def poll() -> None:
             self._between_ticks()
@@ -217,6 +215,7 @@ class Daemon:
 
     def _check_sockets(self) -> None:
         self._sockets.check()
+        self._gateways.check()
         kernel_names.drop_readers()
 
     def _access(self) -> Access:
@@ -232,11 +231,6 @@ class Daemon:
     def _ticked(self, now: float) -> None:
         """Notify systemd of a tick; `now` is its start on the loop's clock [s]."""
         self._notifier.ticked(time.monotonic() if self._virtual else now)
-
-    def _warm_up(self) -> None:
-        assert self._mock_ticks
-        self._mock_ticks()
-        self._loop.warm_up()
 
     def _move_to_neutral(self) -> None:
         """Send neutral and wait until the servo is there, if fishd failed and could not fade."""

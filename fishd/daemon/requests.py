@@ -39,8 +39,8 @@ class Access(NamedTuple):
     telemetry: str = ""
     keyed_telemetry: str = ""
     """Address of telemetry for clients with a key; empty for none."""
-    limitation: str = ""
-    """Line about what is wrong with the sockets; empty if nothing is."""
+    limitation: str | None = None
+    """Line about what is wrong with the sockets; None if nothing is."""
     counters: Mapping[str, int] = {}
     """Numbers of recovered errors since start."""
 
@@ -154,7 +154,7 @@ class Operations:
             clock=self._clock.monotonic(),
             boot_id=self._boot,
             speed=self._speed(),
-            power=loop.power.mean,
+            readings=loop.readings.states(self._clock.monotonic()),
             fy_reversed=loop.perception.lateral_sign.reversed,
             leak=loop.perception.found_leak,
             lease=loop.lease.holder,
@@ -167,7 +167,8 @@ class Operations:
         loop = self._loop
         return (
             *loop.robot.limitations(),
-            *filter(None, [loop.power.trouble, loop.perception.lateral_sign.complaint]),
+            *loop.readings.troubles.values(),
+            *filter(None, [loop.perception.lateral_sign.complaint]),
         )
 
     def _speed(self) -> float | None:
@@ -183,8 +184,7 @@ class Operations:
 
     async def _list_policies(self, _: protocol.NoArguments) -> list[PolicyInfo]:
         self._calls.check_busy()
-        limits = self._loop.limits
-        describe = partial(library.describe_all, limits.tick, limits.amplitude)
+        describe = partial(library.describe_all, self._loop.limits)
         return await self._calls.call("the policy files have not been read", describe)
 
     async def _get_config(self, _: protocol.NoArguments) -> Config:

@@ -58,8 +58,8 @@ class SocketWatch:
         return "" if self._control.problem else self._gateways.control.address
 
     @property
-    def limitation(self) -> str:
-        """Line about files that are gone or in another folder; empty if there are none."""
+    def limitation(self) -> str | None:
+        """Line about files that are gone or in another folder; None if there are none."""
         if problem := self._problem:
             return problem
         if self._control.is_away:
@@ -67,7 +67,7 @@ class SocketWatch:
                 f"the folder of {addresses.default_address()} is gone, as after a logout: the "
                 f"control socket is {self._gateways.control.address}"
             )
-        return ""
+        return None
 
     @property
     def _problem(self) -> str:

@@ -109,13 +109,13 @@ class TrialCalibration:
         except Problem as problem:
             raise Refused("bad-arguments", f"{problem.path[-1]}: {problem}") from None
         lowest, highest = pulses.reach(servo)
-        present, angle = parts.servo.calibration, self._loop.instruction_angle
+        present, instruction_angle = parts.servo.calibration, self._loop.instruction_angle
         same = (calibration.direction, calibration.scale) == (present.direction, present.scale)
-        if not (lowest <= angle <= highest and (same or angle == 0.0)):
+        if not (lowest <= instruction_angle <= highest and (same or instruction_angle == 0.0)):
             raise Refused(
                 "not-neutral",
-                f"the tail is at {angle:+.3f} rad and would jump; bring it to neutral with "
-                "'fishctl stop'",
+                f"the tail is at {instruction_angle:+.3f} rad and would jump; bring it to neutral "
+                "with 'fishctl stop'",
             )
 
     def try_out(self, calibration: ServoCalibration, lease: str) -> None:
@@ -160,8 +160,10 @@ class TrialCalibration:
         It cannot at angle 0, nor without pulses at an angle within the limits.
         """
         lowest, highest = pulses.reach(self._settings.calibrated(before))
-        angle = self._loop.instruction_angle
-        return angle == 0.0 or (not self._loop.servo.on and lowest <= angle <= highest)
+        instruction_angle = self._loop.instruction_angle
+        return instruction_angle == 0.0 or (
+            not self._loop.servo.on and lowest <= instruction_angle <= highest
+        )
 
     def _apply(self, calibration: ServoCalibration) -> None:
         parts = calibrated_parts(self._loop)

@@ -1,12 +1,13 @@
 """Interface between the loop and any fish: protocols, and the robot that joins them."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from fishd.core.calibration import ForceCalibration, ServoCalibration
+from fishd.core.schema import Reading
 from fishd.core.signals import Measurement, Truth
 
 if TYPE_CHECKING:
@@ -46,10 +47,44 @@ class TaredSensor(Protocol):
         """Return a watch that adds up the sensor's values from now on."""
 
 
+class Sensor(Protocol):
+    """Any other sensor, which is sampled outside of the ticks."""
+
+    @property
+    def name(self) -> str:
+        """Name in the configuration."""
+
+    @property
+    def declared(self) -> Mapping[str, Reading]:
+        """Its readings by name."""
+
+    @property
+    def required(self) -> bool:
+        """Whether a reading that is old is a fault."""
+
+    @property
+    def stale_after(self) -> float:
+        """Age from which a reading is old [s]."""
+
+    @property
+    def doubts(self) -> Mapping[str, str]:
+        """Reasons why readings are doubtful, by name; never changed in place."""
+
+    @property
+    def trouble(self) -> str | None:
+        """Reason why the latest attempt to sample failed, one line; None if it did not."""
+
+    def read(self) -> Mapping[str, tuple[float, float]]:
+        """Return time [s, monotonic] and value of each reading that is known; never waits.
+
+        The mapping never changes. A sensor without a thread takes a sample first, if one is due.
+        """
+
+
 class Servo(Protocol):
     """The tail servo."""
 
-    def write(self, angle: float) -> None:
+    def write(self, instruction_angle: float) -> None:
         """Send an instruction angle [rad]; start the pulses if there are none.
 
         Raises `ServoError` when the servo cannot be reached.
@@ -83,14 +118,8 @@ class Robot:
     """Reasons why this robot is not as good as it could be now, a line each."""
     counters: Callable[[], dict[str, int]] = dict
     """Numbers of recovered errors since start, such as failed I2C transfers."""
-    power: Callable[[float], float] | None = None
-    """Mean electrical power of the servo since the previous call [W]; None without a power meter.
-
-    Called after each read of the sensor with the start of the tick [s, monotonic]; never blocks.
-    Raises `SensorError` if the power is not known.
-    """
-    prepare: Callable[[], None] = lambda: None
-    """Called between the ticks of a loop in real time, just before the next read."""
+    sensors: "tuple[Sensor, ...]" = ()
+    """Its other sensors, whose readings each tick takes after the read of the force sensor."""
     countdown: float = math.inf
     """Time for which the servo continues without a write [s]; see `ServoDriver.countdown`."""
     write_recipes: Callable[[Path], None] = lambda control: None

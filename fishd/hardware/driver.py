@@ -1,4 +1,4 @@
-"""Protocols of a driver of a force sensor, a servo or a power meter.
+"""Protocols of a driver of a force sensor, a servo or any other sensor.
 
 docs/how-to/writing-a-driver.md explains how to write one.
 
@@ -8,13 +8,14 @@ suspicion and reconnecting are above it, the same for all drivers.
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 from fishd.core.clock import Clock
 from fishd.core.foreign_code import call_foreign
-from fishd.core.schema import Problem, note, unit
-from fishd.hardware.checks import Check, Machine, Result
-from fishd.hardware.settings import ForceSensorSettings, Gpio, PowerMeterSettings, ServoSettings
+from fishd.core.schema import Problem, Reading, format_reading, note, unit
+from fishd.hardware.checks import Check, Machine, Result, ok
+from fishd.hardware.settings import ForceSensorSettings, Gpio, SensorSettings, ServoSettings
 
 __all__ = [
     "Check",
@@ -26,11 +27,11 @@ __all__ = [
     "LastResort",
     "Machine",
     "Pair",
-    "PowerMeterDriver",
-    "PowerMeterSettings",
-    "PowerSample",
     "Problem",
+    "Reading",
     "Result",
+    "SensorDriver",
+    "SensorSettings",
     "ServoDriver",
     "ServoSettings",
     "note",
@@ -38,10 +39,10 @@ __all__ = [
     "unit",
 ]
 
-S = TypeVar("S", bound=ForceSensorSettings | ServoSettings | PowerMeterSettings)
-T = TypeVar("T", bound=ForceSensorSettings | PowerMeterSettings)
+S = TypeVar("S", bound=ForceSensorSettings | ServoSettings | SensorSettings)
+T = TypeVar("T", bound=ForceSensorSettings | SensorSettings)
 F = TypeVar("F", bound=ForceSensorSettings)
-P = TypeVar("P", bound=PowerMeterSettings)
+R = TypeVar("R", bound=SensorSettings)
 V = TypeVar("V", bound=ServoSettings)
 
 
@@ -120,8 +121,6 @@ class Pair(NamedTuple):
 class SampledDriver(Driver[T]):
     """Driver that delivers samples. One thread calls `open`, `sample` and `close`."""
 
-    transport: ClassVar[str] = "sensor"
-    """Prefix of the counters of errors: `i2c` makes `i2c_errors`."""
     settling: float = 0.0
     """Time for which the hardware is left alone after an error [s]."""
     limitations: tuple[str, ...] = ()
@@ -146,11 +145,12 @@ class SampledDriver(Driver[T]):
 
     @abstractmethod
     def sample(self) -> Any:
-        """Return the next sample, a `Pair` or a `PowerSample`, or None if it is not complete yet.
+        """Return the next sample, or None if it is not complete yet.
 
-        Takes a few milliseconds at most: it sleeps in `clock.sleep`, and must sleep or transfer
-        something before it returns None. May raise any exception, which `explain` describes; after
-        three errors in a row the driver is closed and opened again.
+        That of a force sensor is a `Pair` and takes a few milliseconds at most. It sleeps in
+        `clock.sleep`, and must sleep or transfer something before it returns None. May raise any
+        exception, which `explain` describes; after three errors in a row the driver is closed and
+        opened again.
         """
 
     @abstractmethod
@@ -165,6 +165,8 @@ class SampledDriver(Driver[T]):
 class ForceSensorDriver(SampledDriver[F]):
     """Driver of a force sensor, which delivers pairs of samples."""
 
+    transport: ClassVar[str] = "sensor"
+    """Prefix of the counters of errors: `i2c` makes `i2c_errors`."""
     raw_unit: ClassVar[str] = "V"
     """Unit of the pairs, in which forces are shown until the sensor is calibrated."""
     names: tuple[str, str] = ("F_x", "F_y")
@@ -180,35 +182,56 @@ class ForceSensorDriver(SampledDriver[F]):
         """Return the lowest rate at which healthy hardware delivers pairs [1/s]."""
 
 
-class PowerSample(NamedTuple):
-    """Sample of a power meter."""
+class SensorDriver(SampledDriver[R]):
+    """Driver of any other sensor: it declares its readings, and `sample` returns their values."""
 
-    time: float
-    """Time at which the meter was read [s, monotonic]."""
-    power: float
-    """Mean electrical power into the servo over the latest time that the meter measured [W]."""
-    clipped: str = ""
-    """Reason not to trust the sample, such as an end of the range; empty if it can be trusted."""
+    readings: ClassVar[Mapping[str, Reading]] = {}
+    """Readings by name, such as `{"water_temperature": Reading("°C", "Temperature of the water")}`.
+    A value beyond `low` or `high` is doubtful, but shown."""
+    samples_per_tick: ClassVar[int] = 1
+    """Number of samples in a tick where the configuration sets no period."""
+    is_simulated: ClassVar[bool] = False
+    """Whether it needs no hardware and never waits: a simulated fish has such a sensor, too."""
 
+    def __init__(self, settings: R, clock: Clock, period: float, section: str) -> None:
+        """Import what is needed; open nothing yet.
 
-class PowerMeterDriver(SampledDriver[P]):
-    """Driver of a meter for the electrical power of the servo."""
-
-    def __init__(self, settings: P, clock: Clock, interval: float) -> None:
-        """Do as `SampledDriver`.
-
-        interval: time between two calls of `sample`, which returns the mean over it [s]
+        clock: the only clock that the driver may read and sleep by
+        period: time between two calls of `sample` [s]
+        section: section of its keys in the configuration, such as `sensors.water`, for messages
         """
         super().__init__(settings, clock)
-        self.interval = interval
+        self.period = period
+        self.section = section
+
+    @classmethod
+    def declare(cls, settings: R) -> Mapping[str, Reading]:
+        """Return the readings by name, which may depend on the settings."""
+        return cls.readings
+
+    @property
+    def place(self) -> str:
+        """Name of the sensor in messages."""
+        return self.section
+
+    def open(self) -> None:
+        """Prepare to sample, if that is necessary; see `SampledDriver.open`."""
 
     @abstractmethod
-    def sample(self) -> PowerSample:
-        """Read the meter with a few short transfers; it measures by itself.
+    def sample(self) -> Mapping[str, float] | None:
+        """Return the values of the readings by name, or None if there are none yet.
 
-        It need not wait, because it is never called early. May raise any exception; see
-        `SampledDriver.sample`.
+        One that is missing or NaN keeps its latest value, and grows old. It runs in a thread of its
+        own, so it may wait. May raise any exception; see `SampledDriver.sample`.
         """
+
+    def close(self) -> None:
+        """Release the hardware, if `open` took any; see `SampledDriver.close`."""
+
+    def judge(self, values: Mapping[str, float]) -> Result:
+        """Return the result of the check of `fishctl doctor` for a sample, just after it."""
+        units = {name: reading.unit for name, reading in self.declare(self.settings).items()}
+        return ok(", ".join(f"{n} {format_reading(v, units[n])}" for n, v in values.items()))
 
 
 class LastResort(NamedTuple):

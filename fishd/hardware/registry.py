@@ -7,7 +7,7 @@ from typing import Any
 from fishd.core import text
 from fishd.core.errors import FishdError, MissingPackage, StartupError, UnknownDriver
 from fishd.core.plugins import Plugins
-from fishd.hardware.driver import ForceSensorDriver, PowerMeterDriver, ServoDriver
+from fishd.hardware.driver import ForceSensorDriver, SensorDriver, ServoDriver
 
 FORCE_SENSORS: Plugins[ForceSensorDriver[Any]] = Plugins(
     "force-sensor driver",
@@ -29,14 +29,18 @@ SERVOS: Plugins[ServoDriver[Any]] = Plugins(
     },
     UnknownDriver,
 )
-POWER_METERS: Plugins[PowerMeterDriver[Any]] = Plugins(
-    "power-meter driver",
-    "fishd.power_meters",
-    PowerMeterDriver,
+SENSORS: Plugins[SensorDriver[Any]] = Plugins(
+    "sensor",
+    "fishd.sensors",
+    SensorDriver,
     "Settings",
     {
-        "ina219": "fishd.hardware.power_meter.ina:Ina219",
-        "ina226": "fishd.hardware.power_meter.ina:Ina226",
+        "ads1115": "fishd.hardware.sensors.analog:AnalogInput",
+        "ds18b20": "fishd.hardware.sensors.ds18b20:Ds18b20",
+        "ina219": "fishd.hardware.sensors.ina:Ina219",
+        "ina226": "fishd.hardware.sensors.ina:Ina226",
+        "lsm6dsox": "fishd.hardware.sensors.lsm6dsox:Lsm6dsox",
+        "simulated": "fishd.hardware.sensors.simulated:Simulated",
     },
     UnknownDriver,
 )
@@ -45,6 +49,7 @@ PACKAGES = {
     "adafruit_ads1x15": "adafruit-circuitpython-ads1x15",
     "adafruit_bus_device": "adafruit-circuitpython-busdevice",
     "adafruit_ina219": "adafruit-circuitpython-ina219",
+    "adafruit_lsm6ds": "adafruit-circuitpython-lsm6ds",
     "adafruit_extended_bus": "adafruit-extended-bus",
     "Adafruit_PureIO": "Adafruit-PureIO",
     "board": "Adafruit-Blinka",

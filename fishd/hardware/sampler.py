@@ -2,17 +2,19 @@
 
 import math
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any, Generic, TypeVar
 
 from fishd.core import text
 from fishd.core.clock import Clock
 from fishd.core.foreign_code import call_foreign
-from fishd.hardware.driver import Pair, PowerSample, SampledDriver, read_counters
+from fishd.hardware.driver import Pair, SampledDriver, read_counters
 
-X = TypeVar("X", Pair, PowerSample)
+X = TypeVar("X", Pair, Mapping[str, float])
 
 MAX_SAMPLES = 4096
 """Largest number of samples kept until they are read; the oldest are dropped."""
@@ -91,9 +93,13 @@ class Sampler(Generic[X]):
 class SampledPart(ABC, Generic[X]):
     """Part of the robot whose driver is sampled: in a thread, or in virtual time on request."""
 
-    def __init__(self, driver: SampledDriver[Any], clock: Clock) -> None:
-        """Start nothing yet."""
+    def __init__(self, driver: SampledDriver[Any], clock: Clock, counter: str) -> None:
+        """Start nothing yet.
+
+        counter: prefix of the counters of errors: `i2c` makes `i2c_errors`
+        """
         self._clock = clock
+        self._counter = counter
         self._driver = driver
         self._place = driver.place
         self._sampler: Sampler[X] = Sampler(driver, clock)
@@ -102,10 +108,9 @@ class SampledPart(ABC, Generic[X]):
 
     def counters(self) -> dict[str, int]:
         """Return the numbers of recovered errors since start."""
-        sampler, transport = self._sampler, self._driver.transport
         return {
-            f"{transport}_errors": sampler.errors,
-            f"{transport}_reconnects": sampler.reconnects,
+            f"{self._counter}_errors": self._sampler.errors,
+            f"{self._counter}_reconnects": self._sampler.reconnects,
             **read_counters(self._driver),
         }
 
@@ -114,16 +119,16 @@ class SampledPart(ABC, Generic[X]):
         """Reasons why the samples are not as good as they could be, a line each."""
         return self._driver.limitations
 
-    def close(self) -> None:
+    def close(self, timeout: float = CLOSE_TIMEOUT_S) -> None:
         """Stop sampling and release the hardware; may be called twice, and never hangs.
 
-        A thread that hangs in a transfer is left to end by itself.
+        timeout: longest wait for its thread [s]; one that hangs in a transfer ends by itself
         """
         self._closing.set()
         if self._thread is None:
             self._sampler.close()
         else:
-            self._thread.join(CLOSE_TIMEOUT_S)
+            self._thread.join(timeout)
 
     def _start_thread(self, name: str) -> None:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -146,3 +151,12 @@ class SampledPart(ABC, Generic[X]):
     @abstractmethod
     def _step(self) -> None:
         """Make one attempt to sample."""
+
+
+def close_all(parts: Iterable[SampledPart[Any]]) -> None:
+    """Close parts; wait no longer for many of them that hang than for one."""
+    parts, deadline = list(parts), time.monotonic() + CLOSE_TIMEOUT_S
+    for part in parts:
+        part.close(0.0)
+    for part in parts:
+        part.close(max(0.0, deadline - time.monotonic()))

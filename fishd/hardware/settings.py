@@ -1,4 +1,4 @@
-"""Settings of every force sensor, servo and power meter, and of the operator's panel.
+"""Settings of every force sensor, servo and other sensor, and of the operator's panel.
 
 A driver adds its own keys in a subclass beside its code.
 """
@@ -9,7 +9,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from fishd.core.calibration import Direction, Highest, Lowest, Scale, ServoCalibration, Trim
-from fishd.core.schema import note, unit
+from fishd.core.schema import Reading, note, unit
 
 Gpio = Annotated[int, Meta(ge=0, le=27)]
 """Pin of the Pi's 40-pin header, by its Broadcom number."""
@@ -79,10 +79,28 @@ class ServoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         return msgspec.structs.replace(self, **_calibration_values(calibration))
 
 
-class PowerMeterSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The power meter of the servo; its driver adds further keys."""
+POWER = Reading("W", "Electrical power that the servo takes from its supply.")
+"""The reading `power`, of a power meter or of the model of a simulated servo."""
 
-    driver: Annotated[str, note("Name of the driver of the meter.")] = ""
+
+class SensorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A sensor of `sensors`; its kind adds further keys."""
+
+    kind: Annotated[str, note("Name of the driver of the sensor.")] = ""
+    required: Annotated[
+        bool, note("True: the fault `sensor-lost` while a reading of this sensor is old.")
+    ] = False
+    period: Annotated[
+        Annotated[float, Meta(gt=0, le=3600)] | None,
+        unit("s", "Time between two samples; null: as the kind needs it, mostly a tick."),
+    ] = None
+    stale_after: Annotated[
+        Annotated[float, Meta(gt=0, le=86400)] | None,
+        unit("s", "Age from which a reading counts as old; null: two ticks, at least 3 periods."),
+    ] = None
+    rename: Annotated[
+        dict[str, str], note("Other names for its readings, such as {power: pump_power}.")
+    ] = {}
 
 
 class PanelSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

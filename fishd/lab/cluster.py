@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple, TypeVar
 from uuid import uuid4
 
@@ -29,7 +30,7 @@ CONNECT_TIMEOUT_S = 10.0
 """Timeout of the connection to a scheduler, and of the first answer of its workers [s]."""
 NO_WORKER_TIMEOUT_S = 8.0
 """Time without a worker after which a computation ends: a killed one may be started again [s]."""
-_ANSWER_TIMEOUT_S = 4.0
+_ANSWER_TIMEOUT_S = 10.0
 """Timeout of the scheduler's answers during a computation [s]."""
 _CLOSE_TIMEOUT_S = 0.5
 _WATCH_INTERVAL_S = 0.25
@@ -90,19 +91,22 @@ class Cluster:
         """
         versions = read_versions()
         left: dict[Any, int] = {}
+        done: SimpleQueue[Any] = SimpleQueue()
         try:
             for index, task in enumerate(tasks):
-                left[self._client.submit(_run_checked, versions, function, task, pure=False)] = (
-                    index
-                )
-            last_worker = time.monotonic()
+                future = self._client.submit(_run_checked, versions, function, task, pure=False)
+                left[future] = index
+                future.add_done_callback(done.put)
+            last_worker = next_look = time.monotonic()
             while left:
-                with suppress(TimeoutError):
-                    distributed.wait(list(left), _WATCH_INTERVAL_S, "FIRST_COMPLETED")
-                for future in [future for future in left if future.done()]:
+                with suppress(Empty):
+                    future = done.get(timeout=_WATCH_INTERVAL_S)
                     result = future.result()
                     yield left.pop(future), result
-                now, has_workers = time.monotonic(), self._has_workers()
+                if (now := time.monotonic()) < next_look:
+                    continue
+                has_workers = self._has_workers()
+                next_look = time.monotonic() + _WATCH_INTERVAL_S
                 last_worker = now if has_workers else last_worker
                 if self._stop_deadline and (not has_workers or now > self._stop_deadline):
                     return
@@ -158,6 +162,8 @@ def _open_client(address: str) -> Any:
     thread = threading.Thread(target=open_client, daemon=True)
     thread.start()
     thread.join(CONNECT_TIMEOUT_S)
+    if clients:  # as long again for the workers
+        thread.join(CONNECT_TIMEOUT_S)
     outcome = outcomes[0] if outcomes else TimeoutError()
     try:
         if isinstance(outcome, TimeoutError):

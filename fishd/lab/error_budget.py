@@ -8,22 +8,57 @@ cancels in the ratio of two thrusts.
 import math
 from collections.abc import Iterable, Iterator
 from itertools import groupby
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, Struct
 
 from fishd.core import text
 from fishd.core.beats import upward_reversals
 from fishd.core.calibration import ForceCalibration
 from fishd.core.estimation import SWIM_SETTLE_TIME_S
 from fishd.core.signals import Tick
-from fishd.lab.statistics import Z95
+from fishd.lab.statistics import Z95, per_watt
 
 MIN_ROTATION_RAD = 0.01
 """Smallest rotation that counts; a smaller one hides less than 0.005 % of a thrust."""
 MIN_ELONGATION = 4.0
 """Smallest ratio of the variances along the principal axes that defines their direction."""
+
+
+class Thrust(Struct, frozen=True, kw_only=True):
+    """A mean thrust with its error budget, and the power that it takes."""
+
+    thrust: float
+    """Mean thrust while the fish swims [N]."""
+    thrust_ci95: float | None
+    """Half-width of the 95 % confidence interval of `thrust`, statistical only [N]."""
+    calibration_ci95: float | None = None
+    """Half-width of the 95 % interval of the thrust that the calibration alone causes [N].
+
+    null where the uncertainty of the calibration is unknown.
+    """
+    total_ci95: float | None = None
+    """Half-width of the 95 % interval from `thrust_ci95` and `calibration_ci95` together [N]."""
+    rotation: float = 0.0
+    """Rotation of the sensor's axes that remains after calibration; 0 where none is seen [rad]."""
+    power: float | None = None
+    """Electrical power of the servo while the fish swims [W]; null where unknown."""
+    power_ci95: float | None = None
+    """Half-width of the 95 % confidence interval of `power`, from the spread of beats [W]."""
+    thrust_per_watt: float | None = None
+    """Thrust over electrical power [N/W]."""
+    thrust_per_watt_ci95: float | None = None
+    """Half-width of the 95 % confidence interval of `thrust_per_watt`, statistical only [N/W]."""
+    thrust_per_watt_calibration_ci95: float | None = None
+    """Half-width of the 95 % interval of `thrust_per_watt` due to the calibration [N/W]."""
+    thrust_per_watt_total_ci95: float | None = None
+    """Half-width of the 95 % interval of `thrust_per_watt`, calibration included [N/W]."""
+
+    @property
+    def known_ci95(self) -> float | None:
+        """Total half-width of the thrust; the statistical one if the total is unknown [N]."""
+        return self.thrust_ci95 if self.total_ci95 is None else self.total_ci95
 
 
 class Budget(NamedTuple):
@@ -61,9 +96,63 @@ def budget(
     return Budget(gain_ci95 + hidden, total)
 
 
-def format_with_budget(
+def thrust_fields(
+    calibration: ForceCalibration,
+    thrust: float,
+    thrust_ci95: float | None,
+    power: float | None = None,
+    power_ci95: float | None = None,
+    *,
+    lateral: float = 0.0,
+    rotation: float = 0.0,
+    thrust_per_watt: tuple[float, float] | None = None,
+) -> dict[str, Any]:
+    """Return the fields of a `Thrust`, from a mean thrust [N] and power [W] and their half-widths.
+
+    lateral, rotation: as for `budget`
+    thrust_per_watt: thrust per watt and its half-width; None for the ratio of thrust and power
+    """
+    fields: dict[str, Any] = {"thrust": thrust, "thrust_ci95": thrust_ci95, "rotation": rotation}
+    fields |= {"power": power, "power_ci95": power_ci95}
+    fields |= budget(calibration, thrust, thrust_ci95, lateral, rotation)._asdict()
+    value, ci95 = thrust_per_watt or per_watt(thrust, thrust_ci95, power, power_ci95)
+    if power and value is not None:
+        parts = budget(calibration, value, ci95, lateral / power, rotation)
+        fields |= {
+            "thrust_per_watt": value,
+            "thrust_per_watt_ci95": ci95,
+            "thrust_per_watt_calibration_ci95": parts.calibration_ci95,
+            "thrust_per_watt_total_ci95": parts.total_ci95,
+        }
+    return fields
+
+
+def format_thrust(measured: Thrust, unit: str) -> str:
+    """Return a thrust with its error budget; unit: unit of the force."""
+    return _format_with_budget(
+        measured.thrust,
+        measured.thrust_ci95,
+        measured.calibration_ci95,
+        measured.total_ci95,
+        unit,
+        measured.rotation,
+    )
+
+
+def format_per_watt(measured: Thrust, unit: str) -> str:
+    """Return a known thrust per watt with its error budget; unit: unit of the force."""
+    return _format_with_budget(
+        measured.thrust_per_watt or 0.0,
+        measured.thrust_per_watt_ci95,
+        measured.thrust_per_watt_calibration_ci95,
+        measured.thrust_per_watt_total_ci95,
+        f"{unit} per W",
+    )
+
+
+def _format_with_budget(
     value: float,
-    statistical_ci95: float,
+    statistical_ci95: float | None,
     calibration_ci95: float | None,
     total_ci95: float | None,
     unit: str,
@@ -72,9 +161,8 @@ def format_with_budget(
     """Return a force, or a force for each watt, with its error budget, in thousandths of its unit.
 
     Where the part of the calibration is unknown, the text gives the statistical error and says so.
-
-    rotation: rotation of the sensor's axes, from `visible_rotation`; it is part of the calibration
     """
+    statistical = text.format_half_width(statistical_ci95 or 0.0)
     if calibration_ci95 is None or total_ci95 is None:
         total_ci95 = statistical_ci95
         calibration = "unknown" if unit.startswith("N") else "none"
@@ -82,15 +170,15 @@ def format_with_budget(
         calibration = text.format_half_width(calibration_ci95)
     return (
         f"{text.format_measured(value, total_ci95, unit)} "
-        f"(statistical {text.format_half_width(statistical_ci95)}, calibration {calibration}"
+        f"(statistical {statistical}, calibration {calibration}"
         + (f", with the sensor rotated by {math.degrees(rotation):+.1f}°)" if rotation else ")")
     )
 
 
-def unknown_calibration(calibration_ci95: float | None, unit: str) -> str:
-    """Return a remark on a calibration of unknown uncertainty; empty where it is known."""
-    if calibration_ci95 is not None:
-        return ""
+def warn_of_unknown_calibration(measured: Thrust, unit: str) -> str | None:
+    """Return a remark on a calibration of unknown uncertainty; None where it is known."""
+    if measured.calibration_ci95 is not None:
+        return None
     if unit != "N":
         return (
             f"the force sensor is not calibrated: forces are in {text.quoted(unit)}, and no "

@@ -6,7 +6,7 @@ the same header. Files are written atomically, and each row immediately.
 
 import math
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from operator import itemgetter
@@ -45,8 +45,8 @@ class Progress(Protocol):
     def done(self, line: str, amount: float) -> None:
         """Show a finished step; amount: amount of the total that is finished by now."""
 
-    def at(self, amount: float, result: str = "") -> None:
-        """Show the amount of the total that is finished by now, and a preliminary result."""
+    def at(self, amount: float, result: str | None = None) -> None:
+        """Show the amount of the total that is finished by now, and a new preliminary result."""
 
     def warn(self, line: str) -> None:
         """Show a warning on standard error."""
@@ -80,67 +80,39 @@ class Experiment:
     def __init__(self, path: Path, header: Header) -> None:
         self.path = path
         self.header = header
-        self.is_interrupted = False
-        """Whether it ends before it is complete."""
-        self._table: Table
 
     @property
     def resume_command(self) -> str:
         """Return the command line that resumes the experiment."""
         return shlex.join(["fishctl", *self.header.kind.split(), "--resume", str(self.path)])
 
-    def read_rows(self, columns: Sequence[str]) -> list[dict[str, str]]:
-        """Return the rows of the table, without a last row that is incomplete after a kill.
+    def open_table(self, columns: Sequence[str], name: str = ROWS) -> "KeptTable":
+        """Return a table of the folder; a missing one is created.
 
-        columns: columns of the table in order; a missing table is created
         Raises `ConfigError` where the table has other columns, and `FishdError`.
         """
-        path, expected = self.path / ROWS, list(columns)
-        rows: list[list[str]] = []
-        if path.exists():
-            try:
-                table = tables.read(path, MAX_TABLE_BYTES)
-            except FileProblem as problem:
-                raise ConfigError(f"{path}: {problem}; {_OTHER_FOLDER}") from None
-            if not table:
-                raise ConfigError(
-                    f"{path}: it has no complete line; delete it to measure everything again, or "
-                    f"{_OTHER_FOLDER}"
-                )
-            head, *rows = table
-            if head != expected:
-                raise ConfigError(
-                    f"{path}: {_describe_difference(head, expected)}; {_OTHER_FOLDER}"
-                )
-            rows = [row for row in rows if len(row) == len(expected)]
-            complete = tables.lines([head, *rows])
-            if path.read_bytes() != complete.encode():
-                self.write(ROWS, complete)
-        with self._os_errors_as_fishd_errors():
-            self._table = Table(path, expected)
-        return [dict(zip(expected, row, strict=True)) for row in rows]
+        return KeptTable(self, columns, name)
 
-    def add_row(self, row: Mapping[str, Any]) -> None:
-        """Add a row to the table, numbers in full precision; raises `FishdError`."""
-        with self._os_errors_as_fishd_errors():
-            self._table.add(row)
+    def once(self, name: str, kind: type[T], compute: Callable[[], T]) -> T:
+        """Return the struct in a file of the folder; compute and write it if there is none.
 
-    def write_rows(self, rows: Sequence[Mapping[str, str]]) -> None:
-        """Replace the rows of the table; raises `FishdError`."""
-        columns = self._table.columns
-        self.write(
-            ROWS, tables.lines([columns, *([row[column] for column in columns] for row in rows)])
-        )
+        Raises the errors of `read_struct`, `write_struct` and `compute`.
+        """
+        value = self.read_struct(name, kind)
+        if value is None:
+            value = compute()
+            self.write_struct(name, value)
+        return value
 
     def make_folder(self, name: str) -> Path:
         """Create a subfolder and return its path; raises `FishdError`."""
-        with self._os_errors_as_fishd_errors():
+        with self.os_errors_as_fishd_errors():
             (self.path / name).mkdir(exist_ok=True)
         return self.path / name
 
     def write(self, name: str, content: str | bytes) -> None:
         """Write a file into the folder; raises `FishdError`."""
-        with self._os_errors_as_fishd_errors():
+        with self.os_errors_as_fishd_errors():
             write_atomically(self.path / name, content)
 
     def read_struct(self, name: str, kind: type[T]) -> T | None:
@@ -164,7 +136,7 @@ class Experiment:
         return files.unused_path(self.path, stem, SUFFIX, SUFFIX + PART_SUFFIX)
 
     @contextmanager
-    def _os_errors_as_fishd_errors(self) -> Iterator[None]:
+    def os_errors_as_fishd_errors(self) -> Iterator[None]:
         """Raise `FishdError` in place of an OSError."""
         try:
             yield
@@ -173,6 +145,53 @@ class Experiment:
                 f"{error.filename or self.path}: cannot be written: {error.strerror}; earlier "
                 "results are kept"
             ) from None
+
+
+class KeptTable:
+    """A table in the folder of an experiment, written row by row."""
+
+    def __init__(self, experiment: Experiment, columns: Sequence[str], name: str) -> None:
+        """columns: columns of the table in order
+
+        Raises the errors of `Experiment.open_table`.
+        """
+        self._experiment, self._name = experiment, name
+        path, expected = experiment.path / name, list(columns)
+        rows: list[list[str]] = []
+        if path.exists():
+            try:
+                table = tables.read(path, MAX_TABLE_BYTES)
+            except FileProblem as problem:
+                raise ConfigError(f"{path}: {problem}; {_OTHER_FOLDER}") from None
+            if not table:
+                raise ConfigError(
+                    f"{path}: it has no complete line; delete it to measure everything again, or "
+                    f"{_OTHER_FOLDER}"
+                )
+            head, *rows = table
+            if head != expected:
+                raise ConfigError(
+                    f"{path}: {_describe_difference(head, expected)}; {_OTHER_FOLDER}"
+                )
+            rows = [row for row in rows if len(row) == len(expected)]
+            complete = tables.lines([head, *rows])
+            if path.read_bytes() != complete.encode():
+                experiment.write(name, complete)
+        with experiment.os_errors_as_fishd_errors():
+            self._table = Table(path, expected)
+        self.rows = [dict(zip(expected, row, strict=True)) for row in rows]
+        """Complete rows when the table was opened; a row that a kill has cut off is removed."""
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Add a row, numbers in full precision; raises `FishdError`."""
+        with self._experiment.os_errors_as_fishd_errors():
+            self._table.add(row)
+
+    def replace(self, rows: Sequence[Mapping[str, str]]) -> None:
+        """Replace the rows; raises `FishdError`."""
+        columns = self._table.columns
+        lines = [columns, *([row[column] for column in columns] for row in rows)]
+        self._experiment.write(self._name, tables.lines(lines))
 
 
 def default_folder(kind: str) -> Path:
@@ -184,6 +203,8 @@ def default_folder(kind: str) -> Path:
 @contextmanager
 def open_experiment(path: Path, header: Header, *, resume: bool = False) -> Iterator[Experiment]:
     """Start an experiment in a new folder, or resume one; lock the folder while this lasts.
+
+    The experiment counts as finished unless this ends with an exception.
 
     resume: resume an experiment, whose header must be equal
     Raises `ConfigError` where the folder is in use, belongs to another experiment, or cannot be
@@ -200,9 +221,8 @@ def open_experiment(path: Path, header: Header, *, resume: bool = False) -> Iter
                 started = _with_start(path, header)
                 experiment.write_struct(HEADER, msgspec.structs.replace(started, ended=""))
             yield experiment
-            if not experiment.is_interrupted:
-                ended = msgspec.structs.replace(read_header(path), ended=_now())
-                experiment.write_struct(HEADER, ended)
+            ended = msgspec.structs.replace(read_header(path), ended=_now())
+            experiment.write_struct(HEADER, ended)
     except LockHeld as taken:
         raise ConfigError(f"{path}: another experiment uses it, process {taken.pid}") from None
     except NotALock as error:
@@ -281,11 +301,6 @@ def count_rows(path: Path) -> int | None:
         return max(0, len(tables.read(path / ROWS, MAX_TABLE_BYTES)) - 1)
     except FileProblem:
         return None
-
-
-def count_attempts(path: Path) -> int:
-    """Return a number that grows with each attempt at an experiment that has kept something."""
-    return (count_rows(path) or 0) + sum(1 for _ in path.glob(f"*{SUFFIX}*"))
 
 
 class Answer(NamedTuple):

@@ -228,7 +228,7 @@ def _estimate(
             alpha=float(table["alpha"][index]) if "alpha" in table else UNSET,
             quantities={name: column[index] for name, column in others.items()} or UNSET,
             time=now,
-            power=float(table["power"][index]) if "power" in table else UNSET,
+            readings={"power": float(table["power"][index])} if "power" in table else UNSET,
             suspect=f"the table has no {missing}" if missing else UNSET,
         )
         applied, before = angles[index], now

@@ -27,14 +27,14 @@ LIMITS = {
 }
 
 
-def find_excess(name: str, values: ArrayLike) -> str:
-    """Return in words which value of a quantity is implausible; empty if none is.
+def find_excess(name: str, values: ArrayLike) -> str | None:
+    """Return in words which value of a quantity is implausible; None if none is.
 
     values: finite values in SI units, any shape
     """
     limit = LIMITS[name]
     largest = float(np.max(np.abs(values), initial=0.0))
     if largest <= limit.value * (1.0 + 1e-9):  # 180 degrees are permitted
-        return ""
+        return None
     size = f"{largest:.3g} {limit.unit} somewhere, more than {limit.value:.3g} {limit.unit}"
     return f"{name} is {size}: {limit.advice.format(name, name)}"

@@ -6,17 +6,18 @@ from itertools import groupby, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from msgspec import UNSET, Struct
+from msgspec import UNSET, field
+from msgspec.structs import replace
 
 from fishd.core.beats import upward_reversals
 from fishd.core.errors import ParameterError
 from fishd.core.estimation import PIECE_S, REST_SETTLE_TIME_S, SWIM_SETTLE_TIME_S
-from fishd.core.signals import Tick
-from fishd.lab import error_budget
+from fishd.core.signals import Tick, reading_of
 from fishd.lab.disturbances import RESPONSE_TIMES_S, Disturbance
 from fishd.lab.drift import MIN_FIT_BLOCKS, Array, Blocks, fit
+from fishd.lab.error_budget import Thrust, lateral_force, thrust_fields, visible_rotation
 from fishd.lab.session import Session, refuse_lost
-from fishd.lab.statistics import Z95, per_watt
+from fishd.lab.statistics import Z95
 from fishd.lab.swim_plan import plan, rest_settle_time
 
 MAX_POWER_CHANGE, MAX_REST_POWER = 0.05, 0.01
@@ -53,50 +54,47 @@ class Sample(NamedTuple):
     """Mean electrical power of the servo since the tick before [W]; NaN where unknown."""
 
 
-class ThrustMeasurement(NamedTuple):
-    """The thrust of a controller on a rig, with the data that it was computed from."""
+class Summary(Thrust, frozen=True, kw_only=True):
+    """The thrust of a controller on a rig, as a result."""
 
-    controller: str
-    parameters: Mapping[str, Any]
-    thrust: float
-    """Mean thrust while the fish swims [N]."""
+    controller: str = ""
+    parameters: dict[str, Any] = field(default_factory=dict)
     thrust_ci95: float
-    """Half-width of the 95 % confidence interval of `thrust`, statistical only [N]."""
     frequency: float
     """Frequency of the tail beat [Hz]; 0 where the tail does not beat."""
-    power: float
-    """Mean square of `fin_velocity` while the fish swims, in the square of that quantity's unit."""
+    factor: float
+    """Thrust over the mean square of `fin_velocity`."""
+    factor_ci95: float
+    """Half-width of the 95 % confidence interval of `factor`, by that of the thrust."""
     swims: int
     """Number of swims."""
+    seconds: float = 0.0
+    """Length of the measurement, rests included [s]."""
+    force_unit: str = "N"
+    """Unit of all forces: `N`, or that of the sensor where it is not calibrated."""
+    remark: str = ""
+    """Reason why the thrust may be wrong by more than its error; empty where there is none."""
+    disturbances: Sequence[Disturbance] = ()
+    """Disturbances of the zero that the fit contains."""
+
+
+class ThrustMeasurement(Summary, frozen=True, kw_only=True):
+    """The thrust of a controller on a rig, with the data that it was computed from."""
+
     blocks: Blocks
     """Means of the force in blocks, with times since the first tick."""
     drift: Array
     """Force that each block would have without swimming [N]."""
-    ticks: Sequence[Tick]
+    ticks: Sequence[Tick] = ()
     """Every tick, in order."""
-    unit: str
-    """Unit of all forces: `N`, or that of the sensor where it is not calibrated."""
-    remark: str
-    """Reason why the thrust may be wrong by more than its error; empty where there is none."""
-    watts: float | None = None
-    """Electrical power of the servo while the fish swims [W]; None where unknown."""
-    watts_ci95: float | None = None
-    """Half-width of the 95 % confidence interval of `watts`, from the spread of beats [W]."""
     steps: Sequence["Step"] = ()
     """Differences between neighbouring beats."""
-    calibration_ci95: float | None = 0.0
-    """Half-width of the 95 % interval of the thrust that the calibration alone causes [N].
-
-    None where the uncertainty of the calibration is unknown.
-    """
-    total_ci95: float | None = None
-    """Half-width of the 95 % interval from `thrust_ci95` and `calibration_ci95` together [N]."""
-    rotation: float = 0.0
-    """Rotation of the sensor's axes that remains after calibration; 0 where none is seen [rad]."""
     lateral: float = 0.0
     """Mean F_y that swimming adds [N]."""
-    disturbances: Sequence[Disturbance] = ()
-    """Disturbances of the zero that the fit contains."""
+
+    def summary(self) -> Summary:
+        """Return the result without the data."""
+        return Summary(**{name: getattr(self, name) for name in Summary.__struct_fields__})
 
 
 class Step(NamedTuple):
@@ -137,19 +135,25 @@ def measure(
         raise ParameterError(
             "no whole beat is left of a swim; lengthen the swims with a longer --settle"
         )
-    rotation = error_budget.visible_rotation(ticks)
-    lateral = error_budget.lateral_force(ticks)
-    budget = error_budget.budget(
-        session.calibration, measurement.thrust, measurement.thrust_ci95, lateral, rotation
+    rotation, lateral = visible_rotation(ticks), lateral_force(ticks)
+    fields = thrust_fields(
+        session.calibration,
+        measurement.thrust,
+        measurement.thrust_ci95,
+        measurement.power,
+        measurement.power_ci95,
+        lateral=lateral,
+        rotation=rotation,
     )
-    return measurement._replace(
+    return replace(
+        measurement,
+        **fields,
         controller=controller,
         parameters=dict(parameters),
         ticks=ticks,
-        unit=session.unit,
-        rotation=rotation,
+        seconds=len(ticks) * session.tick,
+        force_unit=session.unit,
         lateral=lateral,
-        **budget._asdict(),
     )
 
 
@@ -165,85 +169,11 @@ def to_samples(ticks: Iterable[Tick]) -> list[Sample]:
             tick.fin_velocity,
             tick.phi_c,
             tick.mode == "running",
-            math.nan if tick.power is UNSET else tick.power,
+            reading_of(tick.readings, "power"),
         )
         for tick in ticks
         if tick.suspect is UNSET
     ]
-
-
-class Summary(Struct, frozen=True):
-    """A measurement without the data that it was computed from."""
-
-    controller: str
-    parameters: dict[str, Any]
-    thrust: float
-    """Mean thrust while the fish swims [N]."""
-    thrust_ci95: float
-    """Half-width of the 95 % confidence interval of `thrust`, statistical only [N]."""
-    frequency: float
-    """Frequency of the tail beat [Hz]."""
-    factor: float
-    """Thrust over the mean square of `fin_velocity`."""
-    swims: int
-    seconds: float
-    """Length of the measurement, rests included [s]."""
-    force_unit: str
-    remark: str
-    power: float | None = None
-    """Electrical power of the servo while the fish swims [W]; null where unknown."""
-    power_ci95: float | None = None
-    """Half-width of the 95 % confidence interval of `power` [W]."""
-    thrust_per_watt: float | None = None
-    """Thrust over electrical power [N/W]."""
-    thrust_per_watt_ci95: float | None = None
-    """Half-width of the 95 % confidence interval of `thrust_per_watt`, statistical only [N/W]."""
-    calibration_ci95: float | None = None
-    """Half-width of the 95 % interval of the thrust that the calibration alone causes [N].
-
-    null where the uncertainty of the calibration is unknown.
-    """
-    total_ci95: float | None = None
-    """Half-width of the 95 % interval from `thrust_ci95` and `calibration_ci95` together [N]."""
-    rotation: float = 0.0
-    """Rotation of the sensor's axes that remains after calibration; 0 where none is seen [rad]."""
-    thrust_per_watt_total_ci95: float | None = None
-    """Half-width of the 95 % interval of `thrust_per_watt`, calibration included [N/W]."""
-    disturbances: Sequence[Disturbance] = ()
-    """Disturbances of the zero that the fit contains."""
-
-
-def summarise(measurement: ThrustMeasurement, tick: float) -> Summary:
-    """Return the summary of a measurement, for output as text or JSON.
-
-    tick: period of the loop [s]
-    """
-    ratio, ratio_ci95 = per_watt(
-        measurement.thrust, measurement.thrust_ci95, measurement.watts, measurement.watts_ci95
-    )
-    return Summary(
-        measurement.controller,
-        dict(measurement.parameters),
-        measurement.thrust,
-        measurement.thrust_ci95,
-        measurement.frequency,
-        measurement.thrust / measurement.power if measurement.power else 0.0,
-        measurement.swims,
-        len(measurement.ticks) * tick,
-        measurement.unit,
-        measurement.remark,
-        measurement.watts,
-        measurement.watts_ci95,
-        ratio,
-        ratio_ci95,
-        measurement.calibration_ci95,
-        measurement.total_ci95,
-        measurement.rotation,
-        per_watt(
-            measurement.thrust, measurement.total_ci95, measurement.watts, measurement.watts_ci95
-        )[1],
-        list(measurement.disturbances),
-    )
 
 
 def evaluate(
@@ -298,21 +228,19 @@ def evaluate(
     )
     result = fit(blocks)
     swimming_time = sum(block.duration for block in swimming)
+    fin_power = sum(block.power * block.duration for block in swimming) / swimming_time
     return ThrustMeasurement(
-        controller="",
-        parameters={},
         thrust=result.force,
         thrust_ci95=result.force_ci95,
         frequency=sum(block.beats for block in swimming) / swimming_time,
-        power=sum(block.power * block.duration for block in swimming) / swimming_time,
+        factor=result.force / fin_power if fin_power else 0.0,
+        factor_ci95=result.force_ci95 / fin_power if fin_power else 0.0,
         swims=sum(phase[0].swims for phase in phases),
         blocks=blocks,
         drift=result.drift,
-        ticks=[],
-        unit="N",
         remark=_find_remark(blocks_of_phases) or (DISTURBED_REMARK if result.is_disturbed else ""),
         steps=own_steps,
-        disturbances=result.disturbances,
+        disturbances=list(result.disturbances),
         **_mean_power(swimming, swim_spread.watts),
     )
 
@@ -353,7 +281,7 @@ def average_phase(phase: Sequence[Sample], tick: float, settle: float) -> "Block
     return _merge(blocks) if blocks else None
 
 
-def _mean_power(swimming: Sequence["Block"], spread: float) -> dict[str, float]:
+def _mean_power(swimming: Sequence["Block"], spread: float) -> dict[str, Any]:
     """Return the mean power of blocks and its error; empty where it is unknown for any of them.
 
     spread: variance of the mean power over one second [W² s]
@@ -362,7 +290,7 @@ def _mean_power(swimming: Sequence["Block"], spread: float) -> dict[str, float]:
     mean = sum(block.watts * block.duration for block in swimming) / duration
     if not math.isfinite(mean):
         return {}
-    return {"watts": mean, "watts_ci95": Z95 * math.sqrt(spread / duration)}
+    return {"power": mean, "power_ci95": Z95 * math.sqrt(spread / duration)}
 
 
 def _merge_blocks(blocks_of_phases: Sequence[list["Block"]]) -> list[list["Block"]]:

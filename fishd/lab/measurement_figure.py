@@ -34,23 +34,21 @@ def draw(measurement: ThrustMeasurement, tick: float, path: str | os.PathLike[st
                     label=label if axes is above else None,
                 )
         above.plot(blocks.time, 1e3 * measurement.drift, color=BLACK, label="drift as fitted")
-        above.set_ylabel(f"F$_x$ as measured (m{plain(measurement.unit)})")
+        above.set_ylabel(f"F$_x$ as measured (m{plain(measurement.force_unit)})")
         extremes = 1e3 * np.concatenate((blocks.force, measurement.drift))
         margin = 0.35 * (extremes.max() - extremes.min()) + 1.0
         above.set_ylim(extremes.min() - margin, extremes.max() + margin)
         above.legend(ncols=4, loc="upper center", bbox_to_anchor=(0.5, 1.2))
-        half_width = (
-            measurement.thrust_ci95 if measurement.total_ci95 is None else measurement.total_ci95
-        )
-        level, error = 1e3 * measurement.thrust, 1e3 * half_width
+        half_width = measurement.known_ci95
+        level, error = 1e3 * measurement.thrust, 1e3 * (half_width or 0.0)
         below.axhspan(level - error, level + error, color=BLUE, alpha=0.2, linewidth=0)
         below.axhline(level, color=BLUE, linewidth=0.8)
         below.axhline(0.0, color=GREY, linewidth=0.6)
-        below.set_ylabel(f"without drift (m{plain(measurement.unit)})")
+        below.set_ylabel(f"without drift (m{plain(measurement.force_unit)})")
         below.set_xlabel("time (s)")
         below.set_title(
             plain(
                 f"{measurement.controller}: "
-                f"{text.format_measured(measurement.thrust, half_width, measurement.unit)}"
+                f"{text.format_measured(measurement.thrust, half_width, measurement.force_unit)}"
             )
         )

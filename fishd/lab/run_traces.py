@@ -77,7 +77,7 @@ class Traces(NamedTuple):
     alpha_rate: Array | None
     """True fin angle and its rate [rad, rad/s]; None for a real fish."""
     quantities: dict[str, Array]
-    """Quantities of the controller by name and unit, as in `since_reversal (s)` or `phase`."""
+    """Readings and quantities of the controller by name and unit, as in `power (W)` or `phase`."""
     portrait: slice | None
     """Samples of the phase portrait; None where no controller swam."""
     events: list[EventLabel]
@@ -111,7 +111,7 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
     simulated = chosen[0].alpha is not UNSET
     time = _checked(run, "the time of a tick", np.array(times))
     swims = [index for index, row in enumerate(rows) if row is not None and _swims(row)]
-    units = _units({tick.controller for tick in chosen})
+    units = _units({tick.controller for tick in chosen}) | run.reading_units
     names = dict.fromkeys(name for tick in chosen for name in _quantities(tick))
     events = [event for event in _label_events(run) if begin <= event.time <= end]
     _checked(run, "the time of an event", np.array([event.time for event in events]))
@@ -301,7 +301,7 @@ def _with_breaks(ticks: list[tuple[Tick, float]]) -> Iterator[tuple[Tick | None,
 
 
 def _quantities(tick: Tick) -> dict[str, float]:
-    return {} if tick.quantities is UNSET else tick.quantities
+    return {**(tick.readings or {}), **(tick.quantities or {})}
 
 
 def _swims(tick: Tick) -> bool:

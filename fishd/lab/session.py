@@ -10,7 +10,6 @@ from copy import deepcopy
 from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
-from msgspec.structs import replace
 
 from fishd.client import Fish
 from fishd.client.lease import LeaseRenewal
@@ -35,6 +34,11 @@ if TYPE_CHECKING:
     from fishd.recording.writer import RunWriter
 
 log = logging.getLogger(__name__)
+
+Swim = Callable[[], list[Tick]]
+Logged = Callable[[str, Mapping[str, Any], float, Swim], list[Tick]]
+"""Function that returns the ticks of a swim of a controller with these parameters, for so many
+seconds: those that it has, or else those of `Swim`. A rest has no controller."""
 
 IDLE_LIMIT = 5.0
 """Time after which an experiment that reads no tick while the fish swims counts as hung [s]."""
@@ -80,16 +84,6 @@ def _count(seconds: float, tick: float) -> int:
     return max(1, round(seconds / tick))
 
 
-SwimLogged = Callable[[str, Mapping[str, Any], float, Callable[[], list[Tick]]], list[Tick]]
-"""Function such as `fishd.lab.swim_log.SwimLog.swim`."""
-
-
-def _swim_unlogged(
-    controller: str, parameters: Mapping[str, Any], seconds: float, swim: Callable[[], list[Tick]]
-) -> list[Tick]:
-    return swim()
-
-
 class Session(ABC):
     """One fish under the control of an experiment; a context manager that leaves it at rest."""
 
@@ -112,15 +106,14 @@ class Session(ABC):
     """Configuration of its loop, as plain data."""
 
     def __init__(self) -> None:
-        self.used = 0.0
+        self._listeners: list[Publisher] = []
+        self._log: Logged | None = None
+        self._finished = self._elapsed = self._planned = 0.0
+
+    @property
+    def used(self) -> float:
         """Tank time used by now, that of interrupted swims included [s]."""
-        self.progress: Callable[[float], None] = lambda used: None
-        """Function that is called with the tank time, tick by tick [s]."""
-        self.listener: Publisher | None = None
-        """Receiver of each tick and event, in order; an exception of it ends a swim or a rest."""
-        self.swim_logged: SwimLogged = _swim_unlogged
-        """Function that swims or rests, unless a resumed experiment has done so before."""
-        self._elapsed = self._planned = 0.0
+        return self._finished + self._elapsed
 
     def __enter__(self) -> Self:
         """Return the session; nothing moves yet."""
@@ -159,7 +152,7 @@ class Session(ABC):
 
         Raises `Refused` for a controller that fishd rejects, `Disturbed`, and `NoDaemon`.
         """
-        return self._logged(
+        return self._find_or_swim(
             controller, parameters, seconds, lambda: self._swim(controller, parameters, seconds)
         )
 
@@ -168,18 +161,45 @@ class Session(ABC):
 
         Raises `Disturbed` and `NoDaemon`.
         """
-        return self._logged("", {}, seconds, lambda: self._rest(seconds))
+        return self._find_or_swim("", {}, seconds, lambda: self._rest(seconds))
 
-    def _logged(
+    def _find_or_swim(
         self,
         controller: str,
         parameters: Mapping[str, Any],
         seconds: float,
-        swim: Callable[[], list[Tick]],
+        swim: Swim,
     ) -> list[Tick]:
-        """Swim or rest, unless the log of a resumed experiment has these ticks."""
-        with self._timed(seconds):
-            return self.swim_logged(controller, parameters, seconds, swim)
+        """Swim or rest, unless the log of a resumed experiment has these ticks.
+
+        The tank time grows by `seconds`; after an exception, only by the part that passed.
+        """
+        self._elapsed, self._planned = 0.0, seconds
+        try:
+            log = self._log
+            ticks = log(controller, parameters, seconds, swim) if log else swim()
+            self._elapsed = seconds
+        finally:
+            self._finished, self._elapsed = self.used, 0.0
+        return ticks
+
+    @contextmanager
+    def heard_by(self, listener: Publisher) -> Iterator[None]:
+        """Pass each tick and event to a listener while this lasts; its exceptions end a swim."""
+        self._listeners.append(listener)
+        try:
+            yield
+        finally:
+            self._listeners.remove(listener)
+
+    @contextmanager
+    def logged(self, log: Logged) -> Iterator[None]:
+        """Pass swims and rests through `log`, as `SwimLog.swim`, while this lasts."""
+        self._log = log
+        try:
+            yield
+        finally:
+            self._log = None
 
     @contextmanager
     def recorded(
@@ -196,32 +216,18 @@ class Session(ABC):
 
         with RunWriter(os.fspath(path), source=self.source, note=note, extra=extra) as writer:
             self.describe(writer)
-            self.listener = _Flushing(writer)
-            try:
+            with self.heard_by(_Flushing(writer)):
                 yield writer
-            finally:
-                self.listener = None
-
-    @contextmanager
-    def _timed(self, seconds: float) -> Iterator[None]:
-        """Add a swim or a rest to the tank time; after an exception, only the part that passed."""
-        self._elapsed, self._planned = 0.0, seconds
-        try:
-            yield
-            self._elapsed = seconds
-        finally:
-            self.used += self._elapsed
-            self._elapsed = 0.0
 
     def _publish(self, message: Tick | Event) -> None:
-        """Count a tick, and pass a tick or an event to the listener."""
+        """Count a tick, and pass a tick or an event to the listeners."""
         if isinstance(message, Tick):
             self._elapsed = min(self._planned, self._elapsed + self.tick)
-            self.progress(self.used + self._elapsed)
-            if self.listener:
-                self.listener.tick(message)
-        elif self.listener:
-            self.listener.event(message)
+            for listener in self._listeners:
+                listener.tick(message)
+        else:
+            for listener in self._listeners:
+                listener.event(message)
 
 
 class _Flushing:
@@ -255,36 +261,19 @@ class VirtualSession(Session):
         self.source: Source = "simulation"
         self.config = msgspec.to_builtins(config)
         self._queue = _MessageQueue()
-        self._calibration = calibration
-        self._run = self._begin(config)
+        self._run = VirtualRun(config, self._queue)
         robot = self._run.loop.robot
+        if calibration and robot.tared:
+            robot.tared.recalibrate(calibration)
         saved = robot.calibrated.sensor.calibration if robot.calibrated else EXACT
         self.calibration = calibration or saved
         self.unit = robot.force_unit
         if robot.calibrated:
             self.servo = config.servo.calibrated(robot.calibrated.servo.calibration)
 
-    def _begin(self, config: Config) -> VirtualRun:
-        run = VirtualRun(config, self._queue)
-        if self._calibration and run.loop.robot.tared:
-            run.loop.robot.tared.recalibrate(self._calibration)
-        return run
-
-    def resume(self, attempts: int) -> None:
-        """Begin again with other noise than the kept measurements have; call before entering.
-
-        attempts: a number that differs for each attempt at the experiment; 0 for the first
-        """
-        if not attempts:
-            return
-        config = self._run.config
-        noise = replace(config.simulation, seed=config.simulation.seed + attempts)
-        self._run.close()
-        self._run = self._begin(replace(config, simulation=noise))
-
     def describe(self, writer: "RunWriter") -> None:
         """Write the configuration and the robot to a recording."""
-        writer.describe(self._run.config, self._run.about())
+        writer.describe(self._run.config, self._run.about(), self._run.readings)
 
     def __exit__(self, *exception: Any) -> None:
         self._run.close()

@@ -1,6 +1,5 @@
 """Log of the swims and rests that an experiment on a live fish has finished, to resume it."""
 
-from collections import deque
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
@@ -9,9 +8,9 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from fishd.core.errors import ConfigError, FishdError, RecordingError
+from fishd.core.errors import FishdError, RecordingError
 from fishd.core.signals import Tick
-from fishd.lab.experiment import ROWS, Experiment
+from fishd.lab.experiment import Experiment
 from fishd.lab.session import Replaced, concerns_one_controller
 from fishd.recording.part_file import PART_SUFFIX
 from fishd.recording.reader import open_run
@@ -19,6 +18,7 @@ from fishd.recording.writer import RunWriter
 
 REQUEST_COLUMNS = ("controller", "parameters", "seconds")
 """Columns of what the experiment requested; a rest has no controller."""
+SWIMS = "swims.csv"
 COLUMNS = (*REQUEST_COLUMNS, "failure", "ticks", "first_tick", "last_tick", "recording")
 
 
@@ -40,10 +40,14 @@ class SwimLog:
         self._last: Tick | None = None
         self._offset = 0
         """Number that is added to the ticks of this fishd, so that numbers always increase."""
-        self._finished = deque[tuple[dict[str, str], list[Tick]]]()
-        rows = experiment.read_rows(COLUMNS)
+        self._table = experiment.open_table(COLUMNS, SWIMS)
+        rows = self._table.rows
         while rows and rows[-1]["failure"]:  # the experiment ended with it: it is tried again
             rows.pop()
+        self._finished: list[tuple[dict[str, str], list[Tick]]] = []
+        """Rows of earlier sessions, each with its ticks."""
+        self._passed = 0
+        """Number of these that this session has requested."""
         read_ticks = cache(_read_ticks)
         for row in rows:
             ticks = []
@@ -54,7 +58,7 @@ class SwimLog:
                 if len(ticks) < int(row["ticks"]):  # the computer lost power
                     break
             self._finished.append((row, ticks))
-        experiment.write_rows([row for row, _ in self._finished])
+        self._drop_after(len(self._finished))
 
     def swim(
         self,
@@ -65,40 +69,40 @@ class SwimLog:
     ) -> list[Tick]:
         """Return the ticks of the next swim or rest in the log; without one, swim and log it.
 
+        Rows from the first one on that is of another request, as that of a search with a larger
+        budget, are dropped.
+
         controller: empty for a rest
         swim: function that swims or rests, and returns the ticks
 
-        Raises the errors of `swim`, that of the log as `Replaced`, and `ConfigError` where the
-        log has another swim.
+        Raises the errors of `swim`, and that of the log as `Replaced`.
         """
         values = (controller, msgspec.json.encode(parameters).decode(), repr(seconds))
         request = dict(zip(REQUEST_COLUMNS, values, strict=True))
-        if self._finished:
-            row, ticks = self._finished.popleft()
-            if any(row[name] != value for name, value in request.items()):
-                raise ConfigError(
-                    f"{self._experiment.path / ROWS}: the table has a swim of "
-                    f"'{row['controller']}' for {row['seconds']} s where this experiment has one "
-                    f"of '{controller}' for {seconds} s; choose a new folder with --folder"
-                )
-            if row["failure"]:
-                raise Replaced(row["failure"])
-        else:
-            try:
-                ticks = swim()
-            except FishdError as error:
-                if concerns_one_controller(error):
-                    self._add(request, failure=str(error))
-                raise
-            self._writer.flush()  # the row promises that the ticks are in the recording
-            self._add(request, ticks=len(ticks), first_tick=ticks[0].seq, last_tick=ticks[-1].seq)
+        if self._passed < len(self._finished):
+            row, ticks = self._finished[self._passed]
+            if all(row[name] == value for name, value in request.items()):
+                self._passed += 1
+                if row["failure"]:
+                    raise Replaced(row["failure"])
+                return self._in_order(ticks)
+            self._drop_after(self._passed)
+        try:
+            ticks = swim()
+        except FishdError as error:
+            if concerns_one_controller(error):
+                self._add(request, failure=str(error))
+            raise
+        self._writer.flush()  # the row promises that the ticks are in the recording
+        self._add(request, ticks=len(ticks), first_tick=ticks[0].seq, last_tick=ticks[-1].seq)
         return self._in_order(ticks)
 
+    def _drop_after(self, count: int) -> None:
+        del self._finished[count:]
+        self._table.replace([row for row, _ in self._finished])
+
     def _add(self, request: dict[str, str], **values: Any) -> None:
-        empty = dict.fromkeys(COLUMNS, "")
-        self._experiment.add_row(
-            {**empty, **request, **values, "recording": self._writer.path.name}
-        )
+        self._table.add({**request, **values, "recording": self._writer.path.name})
 
     def _in_order(self, ticks: list[Tick]) -> list[Tick]:
         """Return the ticks with numbers above the last one, also those of a restarted fishd."""

@@ -39,11 +39,11 @@ from fishd.core.camera_frames import Stack
 from fishd.core.errors import FishdError, PolicyError
 from fishd.core.files import write_atomically
 from fishd.core.text import describe_error, line, quoted
-from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env.environment import SwimEnv, features
 from fishd.learning.env.evaluation import Evaluation, evaluate_in_simulation
 from fishd.learning.env.perception import Perception
 from fishd.learning.extractors import random_angles
+from fishd.learning.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.picture_networks import PictureExtractor, network_nodes
 from fishd.learning.ppo import DeterministicPolicy, MeanAction, activation_of, layers_of
 from fishd.learning.run_folder import checkpoints, runs

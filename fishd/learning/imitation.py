@@ -21,9 +21,9 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from torch.nn.functional import softplus
 
 from fishd.config import Config
-from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.fish_variation import draw_fish
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.ppo import DeterministicPolicy
 from fishd.learning.settings import ImitationSettings, Randomisation, TrainingSettings
 from fishd.virtual.plant.optimum import square_wave

@@ -23,8 +23,8 @@ from fishd.core.camera_frames import Stack
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
 from fishd.lab.drawing import BLUE, open_figure
-from fishd.lab.links.simulated_link import Camera
 from fishd.learning.env.evaluation import judge
+from fishd.learning.links.simulated_link import Camera
 
 SWIM_S, SETTLE_S = 15.0, 5.0
 """Length of the swim, and of its beginning that is left out [s]."""

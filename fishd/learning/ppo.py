@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import Linear
 
+from fishd.controllers.policy.card import READING, is_even
 from fishd.controllers.policy.runtime import HOLD_TIME_S
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import PolicyError
@@ -182,9 +183,10 @@ def make_policy(
 
 
 def even_inputs(settings: TrainingSettings) -> list[int]:
-    """Return the indices of the inputs that are the same for the mirrored fish: F_x."""
-    names = settings.seen.observation * settings.seen.history
-    return [index for index, name in enumerate(names) if name == "fx"]
+    """Return the indices of the inputs that are the same for the mirrored fish."""
+    seen = settings.seen
+    names = (*seen.observation, *(READING + name for name in seen.readings)) * seen.history
+    return [index for index, name in enumerate(names) if is_even(name)]
 
 
 def _policy_class(ppo: PpoSettings, extractor: FeatureExtractor | None) -> type[ActorCriticPolicy]:

@@ -32,6 +32,10 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
         tuple[FeatureName, ...],
         note("Inputs of the agent, in order; forces only where `see` permits them."),
     ] = ("fy", "instruction_angle", "previous_angle", "fin_velocity", "side_time")
+    readings: Annotated[
+        tuple[str, ...],
+        note("Readings of sensors that are further inputs, such as water_temperature."),
+    ] = ()
     history: Annotated[
         int,
         unit(
@@ -63,7 +67,7 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
         unit(
             "N/W",
             "Smallest thrust that justifies a watt of the servo: the reward is for F_x less this "
-            "times the power. Only in simulation: fishd does not send the power to agents.",
+            "times the power. A real fish needs a power meter, whose reading is `power`.",
             ge=0,
             le=1000,
         ),
@@ -388,7 +392,8 @@ def _check(settings: TrainingSettings) -> None:
             f"{settings.imitation.rounds} is not valid with see: {settings.see}; imitation is for "
             "policies that see forces only: 0 is needed",
         )
-    unseen = set(settings.environment.observation) - set(BATCH_FEATURES)
+    seen = (*settings.environment.observation, *settings.environment.readings)
+    unseen = set(seen) - set(BATCH_FEATURES)
     if settings.imitation.rounds and settings.imitation.batched and unseen:
         raise Problem(
             ("imitation", "batched"),
@@ -412,11 +417,11 @@ def _check(settings: TrainingSettings) -> None:
             "true is not valid with pictures and fx in environment.observation, which is the same "
             "for a mirrored fish; false is needed",
         )
-    seen = settings.environment.observation
-    if len(set(seen)) < len(seen):
-        raise Problem(
-            ("environment", "observation"), f"{list(seen)} is not valid: each may be in it once"
-        )
+    for key in ("readings", "observation"):
+        seen = getattr(settings.environment, key)
+        if len(set(seen)) < len(seen):
+            what = f"{list(seen)} is not valid: each may be in it once"
+            raise Problem(("environment", key), what)
     if not seen and settings.see == "force":
         raise Problem(
             ("environment", "observation"),

@@ -14,9 +14,10 @@ import numpy as np
 from msgspec import UNSET, Struct, structs
 from numpy.typing import NDArray
 
+from fishd.core.camera_frames import FrameHead
 from fishd.core.decoding import decoder
 from fishd.core.errors import MissingPackage, RecordingError
-from fishd.core.schema import fields_of, note, unit
+from fishd.core.schema import fields_of, note
 
 IMAGE_TOPIC = "camera"
 IMAGE_SCHEMA = "foxglove.CompressedImage"
@@ -38,24 +39,6 @@ class Timestamp(Struct, frozen=True, gc=False):
 
     sec: int
     nsec: int
-
-
-class FrameHead(Struct, frozen=True, gc=False):
-    """Metadata of a recorded frame, without its picture."""
-
-    t: Annotated[float, unit("s", "Middle of the exposure, unix.")]
-    time: Annotated[
-        float, unit("s", "Middle of the exposure on fishd's monotonic clock, as `time` of a tick.")
-    ]
-    available: Annotated[float, unit("s", "Time of arrival of the frame, on that clock.")]
-    seq: Annotated[int, note("Number of the frame in its session, from 1.")]
-    session: Annotated[str, note("Identifier of one run of the camera on one clock.")]
-    exposure: Annotated[
-        float | None, unit("s", "Duration of the exposure; omitted if unknown.")
-    ] = None
-    dropped_frames: Annotated[
-        int, note("Number of frames that the camera took but did not deliver, since its start.")
-    ] = 0
 
 
 class ImageMessage(FrameHead, frozen=True, kw_only=True, gc=False):

@@ -3,7 +3,8 @@
 import copy
 import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -24,12 +25,13 @@ from msgspec.structs import replace
 
 from fishd.config import Config, adopt
 from fishd.core import strict_yaml, text
+from fishd.core.camera_frames import FrameHead
 from fishd.core.dataframes import ticks_to_frame
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError, RecordingError
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
-from fishd.recording.images import IMAGE_TOPIC, FrameHead, RecordedFrame, decode_frame, decode_head
+from fishd.recording.images import IMAGE_TOPIC, RecordedFrame, decode_frame, decode_head
 from fishd.recording.mcap_file import Appended, Damaged, read_records
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX
 from fishd.recording.provenance import FORMAT
@@ -38,12 +40,15 @@ from fishd.recording.writer import (
     CALIBRATIONS_ATTACHMENT,
     CHANNELS,
     CONFIG_ATTACHMENT,
+    UNITS,
 )
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 T = TypeVar("T")
+
+_decode_units: Callable[[bytes], dict[str, str]] = decoder(dict[str, str])
 
 TOPICS = dict(enumerate((*CHANNELS, IMAGE_TOPIC), start=1))
 """Topics by the channel numbers of `RunWriter`, for a file whose channel records are damaged."""
@@ -147,6 +152,15 @@ class Run:
                 f"{self.path}: the configuration of fishd {version} cannot be read by this one: "
                 f"{error}"
             ) from None
+
+    @property
+    def reading_units(self) -> dict[str, str]:
+        """Unit of each reading of the sensors, by name, as far as they were recorded."""
+        units: dict[str, str] = {}
+        for daemon in self.daemons:
+            with suppress(msgspec.DecodeError):
+                units |= _decode_units(daemon.get(UNITS, "{}").encode())
+        return units
 
     def has_settings(self, number: int) -> bool:
         """Return whether the recording contains the configuration of this fishd."""

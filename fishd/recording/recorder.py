@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
 
 import msgspec
 import zmq
@@ -11,6 +11,7 @@ import zmq
 from fishd.client import Fish
 from fishd.client.zmq_sockets import TELEMETRY_TIMEOUT_S, Subscription, connect_subscriber
 from fishd.core import text
+from fishd.core.camera_frames import FrameHead, Pixels
 from fishd.core.errors import FishError, NoDaemon, RecordingError, Refused
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Status
@@ -19,7 +20,6 @@ from fishd.recording.writer import CHANNELS, RunWriter
 
 if TYPE_CHECKING:
     from fishd.core.keys import Access
-    from fishd.recording.camera_tap import CameraTap
 
 DRAIN_INTERVAL_S = 0.2
 """Interval at which messages are read from their queue, to wake up rarely [s]."""
@@ -56,6 +56,22 @@ TAKEOVER_MESSAGE = (
 )
 
 
+class FrameSource(Protocol):
+    """A camera whose frames are recorded, such as `fishd.camera.tap.CameraTap`."""
+
+    def set_time(self, t: float, monotonic: float) -> None:
+        """Set the clock offset from the times of a tick: unix, and on fishd's clock [s]."""
+
+    def take(self) -> tuple[list[str], list[tuple[FrameHead, Pixels]]]:
+        """Return a line for the user per change of the camera's state, and the new frames."""
+
+    def count_missing(self) -> int | None:
+        """Return how many published frames have not arrived; None if the camera does not say."""
+
+    def close(self) -> None:
+        """Disconnect; may be called twice."""
+
+
 class Position(NamedTuple):
     """Position of a recorder in the ticks of a fishd."""
 
@@ -77,7 +93,7 @@ class Recorder:
         after: Position | None = None,
         progress: Callable[[RunWriter], None] = lambda writer: None,
         due: Callable[[RunWriter], bool] = lambda writer: False,
-        camera: "CameraTap | None" = None,
+        camera: FrameSource | None = None,
     ) -> None:
         """
         endpoint: control socket of fishd; None for that of this machine
@@ -267,7 +283,7 @@ class Recorder:
         self._doubt(line)
         self.reason = f"{self.reason}; {line}"
 
-    def _take_frames(self, camera: "CameraTap") -> None:
+    def _take_frames(self, camera: FrameSource) -> None:
         news, frames = camera.take()
         for line in news:
             self._tell(line)
@@ -365,7 +381,7 @@ class Description(NamedTuple):
     def write(self, writer: RunWriter) -> None:
         """Write the description to a recording; raise `RecordingError`."""
         about = {name: str(getattr(self.status, name)) for name in STATUS_FIELDS}
-        writer.describe(self.config, about)
+        writer.describe(self.config, about, self.status.readings)
         if self.calibrations is not None:
             writer.calibrated(self.calibrations)
 

@@ -11,13 +11,12 @@ from functools import cached_property
 from typing import Any, Self
 
 import zmq
-from msgspec import UNSET
 from msgspec.structs import replace
 
 from fishd import __version__
 from fishd.core import addresses, protocol
 from fishd.core.errors import RecordingError, Refused, StartupError
-from fishd.core.signals import Event, Percentiles, Status, Tick, Timing
+from fishd.core.signals import Event, Percentiles, ReadingState, Status, Tick, Timing
 from fishd.recording.reader import Run
 
 MAX_PAUSE_S = 5.0
@@ -94,6 +93,7 @@ class Replay:
         """Return the recorded or a synthetic status, updated to the latest published tick."""
         tick = self._tick
         status = self._recorded or self._synthetic_status
+        values = tick.readings or {}
         return replace(
             status,
             t=tick.t,
@@ -108,7 +108,10 @@ class Replay:
             seq=tick.seq,
             missed_slots=tick.missed_slots,
             phi_c=tick.phi_c,
-            power=None if tick.power is UNSET else tick.power,
+            readings={
+                name: replace(reading, value=values.get(name))
+                for name, reading in status.readings.items()
+            },
             pid=os.getpid(),
             telemetry=self.telemetry,
             name=f"replay of {self._run.name}",
@@ -154,6 +157,17 @@ class Replay:
             recovered_errors={},
             realtime=False,
             telemetry=self.telemetry,
+            readings={
+                name: ReadingState(
+                    unit=reading.unit,
+                    description=reading.description,
+                    sensor=name,
+                    value=None,
+                    age=None,
+                    problem=None,
+                )
+                for name, reading in config.readings.items()
+            },
         )
 
     def _answer_until(self, deadline: float) -> None:

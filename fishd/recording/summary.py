@@ -6,11 +6,11 @@ from typing import Any, NamedTuple, TypeAlias
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
+from fishd.core.camera_frames import FrameHead
 from fishd.core.decoding import decoder
 from fishd.core.robots import find_kind
 from fishd.core.signals import Event, Status, Tick
 from fishd.recording.axis import Axis, ClockStep, ClockSteps
-from fishd.recording.images import FrameHead
 
 
 class Gap(NamedTuple):
@@ -53,8 +53,8 @@ class Summary(Struct):
     It is the mean of those of the ticks: all ticks share the error of one zero, which does not
     average out.
     """
-    power: float | None = None
-    """Mean electrical power of the servo while a controller swam; None if unknown [W]."""
+    readings: dict[str, float] = {}
+    """Means of the readings of the sensors while a controller swam, by name."""
     swim_ticks: dict[str, int] = {}
     """Number of ticks in mode running, by controller."""
     force_unit: str = "N"
@@ -81,7 +81,7 @@ class TickHead(Struct, frozen=True, gc=False):
     thrust: float
     frequency: float
     thrust_ci95: float | UnsetType = UNSET
-    power: float | UnsetType = UNSET
+    readings: dict[str, float] | UnsetType = UNSET
     time: float = 0.0
     busy_time_us: float = 0.0
 
@@ -109,7 +109,7 @@ class Tally:
         self._sent = 0
         """Number of the latest tick that the present fishd is known to have published; 0 if no."""
         self._counts = Summary(swim_ticks={})
-        """What was counted until now; `summary` adds what is computed."""
+        """Counts until now; `summary` adds what is computed."""
         self._first = self._position = 0.0
         self._clock_steps = ClockSteps()
         self._is_real_time = True
@@ -117,7 +117,8 @@ class Tally:
         self._impulse = 0.0
         self._known_ticks = 0
         self._thrust = self._error = 0.0
-        self._energy, self._metered = 0.0, 0
+        self._readings: dict[str, tuple[float, int]] = {}
+        """Sum and number of the values of each reading."""
         self._last_frame: FrameHead | None = None
 
     def set_daemon(self, daemon: Mapping[str, str]) -> None:
@@ -156,9 +157,9 @@ class Tally:
                 self._known_ticks += 1
                 self._thrust += tick.thrust
                 self._error += tick.thrust_ci95
-            if tick.power is not UNSET:
-                self._energy += tick.power
-                self._metered += 1
+            for name, value in (tick.readings or {}).items():
+                total, count = self._readings.get(name, (0.0, 0))
+                self._readings[name] = total + value, count + 1
             counts.swim_ticks[tick.controller] = counts.swim_ticks.get(tick.controller, 0) + 1
         is_same_fishd = last is None or tick.seq > last.seq
         if not is_same_fishd:  # it counts from 1
@@ -257,7 +258,7 @@ class Tally:
             lost_ticks=sum(gap.lost for gap in self.gaps),
             thrust=thrust,
             thrust_ci95=error,
-            power=self._energy / self._metered if self._metered else None,
+            readings={name: total / count for name, (total, count) in self._readings.items()},
             swim_ticks=swim_ticks,
             clock_steps=tuple(self.clock_steps),
         )

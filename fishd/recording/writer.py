@@ -17,16 +17,16 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from fishd.config import Config, to_yaml
+from fishd.core.camera_frames import FrameHead
 from fishd.core.decoding import decoder
 from fishd.core.errors import RecordingError
 from fishd.core.protocol import Calibrations
-from fishd.core.schema import json_schema, schema_name
+from fishd.core.schema import Reading, json_schema, schema_name
 from fishd.core.signals import Event, Status, Tick
 from fishd.recording.axis import Axis
 from fishd.recording.images import (
     IMAGE_SCHEMA,
     IMAGE_TOPIC,
-    FrameHead,
     encode_frame,
     image_json_schema,
 )
@@ -51,6 +51,8 @@ CHUNK_BYTES = 32 * 2**10
 """Size at which a chunk is closed, which blocks the writer for 0.5 ms [bytes]."""
 MAX_TIME_S = 1e10
 """Largest time of a message, before or after 1970: MCAP counts nanoseconds in 64 bits [s]."""
+UNITS = "reading_units"
+"""Key of the metadata of a fishd with the units of its readings, as JSON."""
 CONFIG_ATTACHMENT, CALIBRATIONS_ATTACHMENT = "config.yaml", "calibrations.json"
 """Names of attachments."""
 
@@ -104,16 +106,7 @@ class RunWriter:
         self._writer = Writer(self._file, CHUNK_BYTES, CompressionType.ZSTD)  # type: ignore[arg-type]
         self._writer.start(profile="", library="fishd")
         self._writer.add_metadata("fishd.run", about)
-        self._channels = {
-            topic: self._writer.register_channel(
-                topic,
-                "json",
-                self._writer.register_schema(
-                    schema_name(message), "jsonschema", json_schema(message)
-                ),
-            )
-            for topic, message in CHANNELS.items()
-        }
+        self._channels: dict[str, int] = {}
         self.flush()
 
     def __enter__(self) -> Self:
@@ -151,17 +144,23 @@ class RunWriter:
         return self._file.free()
 
     def describe(
-        self, config: Config | Mapping[str, Any], daemon: Mapping[str, str] | None = None
+        self,
+        config: Config | Mapping[str, Any],
+        daemon: Mapping[str, str] | None = None,
+        readings: Mapping[str, Reading] | None = None,
     ) -> None:
         """Record the configuration of the following ticks.
 
         Call it at the start, and again when another fishd takes over.
 
         daemon: metadata of that fishd, such as its process
+        readings: readings of its sensors; those of the first fishd are in the schema of the ticks
         Raise `RecordingError` if it cannot be written.
         """
-        number = str(self.tally.restarts)
-        self._writer.add_metadata("fishd.daemon", {"number": number, **(daemon or {})})
+        self._register_channels(readings or {})
+        units = {name: reading.unit for name, reading in (readings or {}).items()}
+        about = {"number": str(self.tally.restarts), **(daemon or {}), UNITS: _to_json(units)}
+        self._writer.add_metadata("fishd.daemon", about)
         self.tally.set_daemon(daemon or {})
         yaml = to_yaml(config if isinstance(config, Config) else dict(config))
         self._attach(CONFIG_ATTACHMENT, "application/yaml", yaml.encode())
@@ -191,6 +190,7 @@ class RunWriter:
         Raise `MissingPackage` without OpenCV (extra: camera).
         """
         payload = encode_frame(head, pixels)
+        self._register_channels({})
         if IMAGE_TOPIC not in self._channels:
             schema = self._writer.register_schema(IMAGE_SCHEMA, "jsonschema", image_json_schema())
             self._channels[IMAGE_TOPIC] = self._writer.register_channel(IMAGE_TOPIC, "json", schema)
@@ -232,6 +232,7 @@ class RunWriter:
         if self._closed:
             return
         try:
+            self._register_channels({})
             self._writer.add_metadata(
                 "fishd.end", to_metadata(self.tally.summary) | {"reason": reason}
             )
@@ -243,6 +244,18 @@ class RunWriter:
         except OSError as error:
             raise self._failed(error) from None
         self._give_up()
+
+    def _register_channels(self, readings: Mapping[str, Reading]) -> None:
+        """Register the topics of telemetry, unless they are: with the numbers that readers know."""
+        if self._channels:
+            return
+        for topic, message in CHANNELS.items():
+            schema = self._writer.register_schema(
+                schema_name(message),
+                "jsonschema",
+                json_schema(message, readings if message is Tick else None),
+            )
+            self._channels[topic] = self._writer.register_channel(topic, "json", schema)
 
     def _note_stored(self) -> None:
         self._stored, self.stored_seq = self.tally.summary, self.tally.seq
@@ -276,6 +289,7 @@ class RunWriter:
         for time in times_of(message):
             if not abs(time) <= MAX_TIME_S:
                 raise RecordingError(f"{self.path}: {time:g} s is not a valid time")
+        self._register_channels({})
         position = place(self._axis, message, arrival)
         published = max(0, round(message.t * 1e9))
         if self._origin_ns is None:
@@ -312,6 +326,10 @@ class RunWriter:
             f"{error.strerror or error}; the written part is readable; {remedy}, then run fishctl "
             f"recover {self.part}"
         )
+
+
+def _to_json(value: Any) -> str:
+    return msgspec.json.encode(value).decode()
 
 
 _DECODERS: dict[str, Callable[[bytes], TickHead | Event | Status]] = {

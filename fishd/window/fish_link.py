@@ -26,7 +26,7 @@ from fishd.window.live import encode_message
 log = logging.getLogger(__name__)
 
 MAX_TICKS = 2400
-"""Number of ticks in the history for a page that opens: two minutes of 20 Hz."""
+"""Number of ticks in the history for a page that opens; it bounds memory, whatever the tick."""
 HISTORY_AGE_S = 1.0
 """Longest age of the encoded history that is sent again [s]."""
 PART_TICKS = 200
@@ -385,12 +385,12 @@ def _builtins(result: Struct) -> dict[str, Any]:
 
 
 def _columns(payloads: Iterable[bytes]) -> dict[str, Any]:
-    """Return ticks as columns by field; those of the quantities are in a mapping."""
+    """Return ticks as columns by field; those of quantities and readings are in mappings."""
     ticks = [_decode_tick(payload) for payload in payloads]
     columns: dict[str, Any] = {}
     for name in Tick.__struct_fields__:
         column = [getattr(tick, name) for tick in ticks]
-        if name == "quantities":
+        if name in ("quantities", "readings"):
             columns[name] = _transpose([{} if row is UNSET else row for row in column])
         elif name not in _OPTIONAL or any(value is not UNSET for value in column):
             columns[name] = [None if value is UNSET else value for value in column]

@@ -6,14 +6,14 @@ the subscription, a time and the JSON that fishd sent.
 
 import struct
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import msgspec
 from msgspec import Struct
 
 from fishd.core.decoding import decoder
-from fishd.core.schema import json_schema, schema_name
+from fishd.core.schema import Reading, json_schema, schema_name
 from fishd.core.signals import Event, Status, Tick
 from fishd.window.viewer import Viewer
 
@@ -44,8 +44,12 @@ _decode: Callable[[bytes], _ClientMessage] = decoder(_ClientMessage)
 class FoxglovePage(Viewer):
     """One connected Foxglove or Lichtblick."""
 
-    def __init__(self, name: str, session: str) -> None:
-        """name: name of the fish; session: differs after each start of the window"""
+    def __init__(self, name: str, session: str, readings: Mapping[str, Reading]) -> None:
+        """
+        name: name of the fish
+        session: differs after each start of the window
+        readings: readings of its sensors, for the schema of its ticks
+        """
         super().__init__()
         self._topics = dict(enumerate(CHANNELS))
         self._subscriptions: dict[int, str] = {}
@@ -61,7 +65,9 @@ class FoxglovePage(Viewer):
                     "encoding": "json",
                     "schemaName": schema_name(CHANNELS[topic]),
                     "schemaEncoding": "jsonschema",
-                    "schema": json_schema(CHANNELS[topic]).decode(),
+                    "schema": json_schema(
+                        CHANNELS[topic], readings if topic == "tick" else None
+                    ).decode(),
                 }
                 for number, topic in self._topics.items()
             ],

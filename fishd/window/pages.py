@@ -120,7 +120,7 @@ class Pages:
         if access.scope is None:
             raise web.HTTPUnauthorized(text="this device is not paired\n")
         link = self.find_link(request.query.get("fish", next(iter(self.links))))
-        page = FoxglovePage(link.name, self._session)
+        page = FoxglovePage(link.name, self._session, link.status.readings if link.status else {})
         page.device_id = access.device_id
         link.listeners.add(page.add)
         try:

@@ -55,7 +55,7 @@ class _Place:
             self.timeout = None
 
     def end(self) -> None:
-        """End the connection at once; while its transport is created, `_Door` does so."""
+        """End the connection at once; while its transport opens, `_ServedConnection` does so."""
         self.group.remove(self)
         self.is_ended = True
         if self.transport:
@@ -221,8 +221,8 @@ class Places:
         place.is_silent = False
         place.group.add(place)
         loop = asyncio.get_running_loop()
-        door = partial(_Door, self, place)
-        opening = loop.create_task(loop.connect_accepted_socket(door, place.connection))
+        protocol = partial(_ServedConnection, self, place)
+        opening = loop.create_task(loop.connect_accepted_socket(protocol, place.connection))
         self._opening.add(opening)
         opening.add_done_callback(self._opening.discard)
 
@@ -232,7 +232,7 @@ class Places:
         return self._paired_devices if address in self._paired else self._others
 
 
-class _Door(asyncio.BufferedProtocol):
+class _ServedConnection(asyncio.BufferedProtocol):
     """Protocol of a connection that has sent something: that of the HTTP server, and its place.
 
     All connections are read into one buffer, one after the other.

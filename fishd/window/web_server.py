@@ -14,7 +14,7 @@ import socket
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Set
 from importlib.resources.abc import Traversable
 from pathlib import PurePosixPath
-from typing import Any
+from typing import Any, Self
 from urllib.parse import urlsplit
 
 from aiohttp import http_exceptions, web
@@ -100,7 +100,7 @@ class WebServer:
         )
         self._app.router.add_routes(routes)
 
-    async def __aenter__(self) -> "WebServer":
+    async def __aenter__(self) -> Self:
         """Listen; raises `StartupError`."""
         self._runner = web.AppRunner(
             self._app,

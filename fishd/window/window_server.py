@@ -4,6 +4,7 @@ import asyncio
 import logging
 from contextlib import AsyncExitStack
 from importlib import resources
+from typing import Self
 from urllib.parse import urlsplit
 
 from aiohttp import web
@@ -70,7 +71,7 @@ class WindowServer(WebServer):
             advice="name another one with --listen",
         )
 
-    async def __aenter__(self) -> "WindowServer":
+    async def __aenter__(self) -> Self:
         """Listen, and follow the fish; raises `StartupError`."""
         async with AsyncExitStack() as stack:
             stack.enter_context(self._register)

@@ -29,8 +29,12 @@ def own_daemon(tmp_path: Path) -> Iterator[Daemon]:
 
 
 @pytest.fixture(scope="module")
-def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    with running(tmp_path_factory.mktemp("daemon")) as module_daemon:
+def shared_daemon(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Daemon]:
+    """Yield the daemon of a module, started with the arguments in its `DAEMON`."""
+    arguments = getattr(request.module, "DAEMON", ())
+    with running(tmp_path_factory.mktemp("daemon"), *arguments) as module_daemon:
         yield module_daemon
 
 

@@ -13,7 +13,7 @@ from fishd.controllers import registry
 from fishd.core import robots
 from fishd.core.clock import VirtualClock
 from fishd.hardware.base import Robot
-from fishd.hardware.registry import FORCE_SENSORS, SERVOS
+from fishd.hardware.registry import FORCE_SENSORS, SENSORS, SERVOS
 from fishd.hardware.servo.pigpio import Pigpio
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.ads1115 import Ads1115Chip
@@ -29,6 +29,7 @@ from rigs.hx711_chip import GpioStandIn, Hx711Chip
 from rigs.lockstep_rig import LockstepRig
 from rigs.pca9685_chip import Pca9685Chip
 from rigs.processes import FISHCTL
+from rigs.sensor_chips import KellerChip
 
 MILLIVOLTS_PER_NEWTON = 20.0
 BUS = 204
@@ -53,7 +54,7 @@ def fishctl(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 def forget_drivers() -> None:
     """Reload the drivers, plants, robots and controllers of other packages."""
-    for plugins in (FORCE_SENSORS, SERVOS, PLANTS, robots.registry(), registry._plugins):
+    for plugins in (FORCE_SENSORS, SERVOS, SENSORS, PLANTS, robots.registry(), registry._plugins):
         plugins._found.clear()
         vars(plugins).pop("_offered", None)
 
@@ -76,6 +77,25 @@ class LoadCellRig(LockstepRig):
 
         chips = {6: Hx711Chip(clock, partial(volts, 0)), 13: Hx711Chip(clock, partial(volts, 3))}
         self.gpio = stack.enter_context(GpioStandIn(clock, 5, chips))
+        still = self.pi.pigpiod.stands_still
+        return _robot(config, clock, stack, self.pi.pigpiod.port, partial(Pigpio, standstill=still))
+
+
+class DepthRig(LockstepRig):
+    """Fish on a virtual Pi with a Keller LD on the bus of its force sensor."""
+
+    robot_name = "pi"
+
+    def open_robot(self, stack: ExitStack) -> Robot:
+        config, clock = self.config, VirtualClock()
+        clock.now = -config.tick
+        settings = VirtualPiSettings(pigpio_port=0, power_meter=None)
+        self.pi = VirtualPi(settings, config.plant, SimulationSettings(), config.tick, clock)
+        self.keller = KellerChip(clock)
+        self.pi.bus.attach(0x40, self.keller)
+        stack.enter_context(self.pi)
+        set_timeout = partial(setattr, self.pi.bus, "timeout")
+        stack.enter_context(LinuxI2c(self.pi.bus.transfer, {settings.bus}, set_timeout))
         still = self.pi.pigpiod.stands_still
         return _robot(config, clock, stack, self.pi.pigpiod.port, partial(Pigpio, standstill=still))
 

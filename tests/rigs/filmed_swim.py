@@ -9,8 +9,9 @@ from fishd.config import load
 from fishd.core.camera_frames import Frame
 from fishd.core.signals import Tick
 from fishd.lab.session import VirtualSession
+from rigs.harness import PINNED_TICK
 
-NOISY = ("simulation.noise=1e-3", "simulation.offset_y=5e-3", "simulation.drift=5e-3")
+NOISY = (PINNED_TICK, "simulation.noise=1e-3", "simulation.offset_y=5e-3", "simulation.drift=5e-3")
 
 
 def swum(seconds: float, *overrides: str, controller: str = "excitation") -> list[Tick]:

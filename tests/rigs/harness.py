@@ -15,6 +15,9 @@ from fishd.core.signals import Event, Measurement, Observation, Tick
 from fishd.hardware.base import Robot
 from fishd.virtual.plant.tethered import TetheredFish
 
+PINNED_TICK = "tick=0.05"
+"""Override with which tests count in ticks, whatever the default is."""
+
 
 class Recorder:
     """Publisher that stores everything."""
@@ -47,7 +50,7 @@ class Rig:
         stack: ExitStack | None = None,
     ) -> None:
         """stack: closes the resources of the robot"""
-        self.config: Config = load(None, overrides)
+        self.config: Config = load(None, (PINNED_TICK, *overrides))
         self.clock = VirtualClock()
         self.recorder = Recorder()
         self.robot = wrap(self.open_robot(stack or ExitStack()))
@@ -172,7 +175,7 @@ class Wrapped:
             sensor=self,
             servo=self,
             truth=self._robot.truth,
-            power=self._robot.power,
+            sensors=self._robot.sensors,
         )
 
     def read(self, now: float) -> Measurement:

@@ -38,7 +38,7 @@ Attack = Callable[[random.Random, int], bytes]
 
 
 def garbage(chance: random.Random, port: int) -> bytes:
-    """Return bytes that are no request."""
+    """Return random bytes instead of a request."""
     return chance.randbytes(chance.randrange(1, 200))
 
 
@@ -126,7 +126,7 @@ def _frame(first: int, payload: bytes, masked: bool = True) -> bytes:
 
 
 class Mistake(Exception):
-    """The window answered with an error of its own."""
+    """The window answered with status 500."""
 
 
 async def send(payload: bytes, port: int) -> None:

@@ -11,11 +11,11 @@ from mcap.opcode import Opcode
 
 from fishd.config import Config
 from fishd.core.calibration import ForceCalibration, ServoCalibration
+from fishd.core.camera_frames import FrameHead
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Percentiles, Status, Timing
 from fishd.lab.simulation import simulate
 from fishd.recording import RunWriter, open_run
-from fishd.recording.images import FrameHead
 
 MAGIC = b"\x89MCAP0\r\n"
 Record = tuple[int, bytes]

@@ -41,7 +41,7 @@ PROVENANCE = Provenance(
 )
 
 
-def card(*features: tuple[FeatureName, float], tick: float = 0.05, amplitude: float = 0.42) -> Card:
+def card(*features: tuple[Any, ...], tick: float = 0.05, amplitude: float = 0.42) -> Card:
     """Return a card; by default the policy sees the current angle, over Φ."""
     return Card(
         observation=tuple(Feature(*f) for f in features or (("instruction_angle", 0.42),)),

@@ -42,8 +42,7 @@ START: tuple[str, ...] = (FISHD,)
 EXPERIMENT: tuple[str, ...] = (FISHCTL,)
 """Command that starts a separate fishctl, for an experiment on a fishd."""
 if not os.environ.get("JUDGES_REAL_TIME"):
-    # Without the warm-up, the load is half.
-    _settings = sets("realtime.warm_up=false", f"control.lease={LEASE:g}")
+    _settings = sets(f"control.lease={LEASE:g}")
     START = (*preloaded.UNHURRIED_COMMAND, "fishd", *_settings)
     EXPERIMENT = (*preloaded.UNHURRIED_COMMAND, "fishctl")
 

@@ -7,10 +7,10 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from fishd.camera.simulated import DEFAULT
 from fishd.config import Config
 from fishd.controllers.policy.card import Card, Window
-from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning import extractors
 from fishd.learning.env.environment import features
 from fishd.learning.env.perception import Perception
+from fishd.learning.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.ppo import make_policy
 from fishd.learning.run_folder.runs import make_card
 from fishd.learning.settings import TrainingSettings

@@ -12,16 +12,17 @@ from msgspec.structs import replace
 
 from fishd.config import load
 from fishd.core.signals import Observation
-from fishd.lab.links.link import LinkLost, StepResult
-from fishd.lab.links.simulated_link import SimulatedLink
+from fishd.learning.links.link import LinkLost, StepResult
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings
 from fishd.learning.train.jobs import Job
+from rigs.harness import PINNED_TICK
 from rigs.processes import fishctl
 
 LONG_ENOUGH = 120.0
 """Longest time until a training has a result, including the import of torch [s]."""
 Done = subprocess.CompletedProcess[str]
-NOISY = ("simulation.noise=0.001", "simulation.offset_y=0.005")
+NOISY = (PINNED_TICK, "simulation.noise=0.001", "simulation.offset_y=0.005")
 BRIEF = TrainingSettings(
     steps=128,
     ppo=PpoSettings(n_steps=64, n_epochs=4, log_std_init=0.7),

@@ -35,14 +35,11 @@ async def ask():
 asyncio.run(ask())
 """
 CAMERA = """
-import sys, zmq
+import sys
 from fishd.camera.requests import CameraRequests
 
-with zmq.Context() as context:
-    try:
-        print(CameraRequests(sys.argv[1], context, float(sys.argv[2])).settings().source)
-    finally:
-        context.destroy(linger=0)
+with CameraRequests(sys.argv[1], float(sys.argv[2])) as camera:
+    print(camera.settings().source)
 """
 LONG_TEXT = "x" * 1_000_000
 """Text that takes a moment to be read, after the client continues."""

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-import zmq
 from rigs import half_open
 from rigs.camera_process import COMMAND
 from rigs.distant_daemon import DistantDaemon, running_at_a_distance
@@ -247,11 +246,9 @@ def test_a_name_that_is_not_known_is_said_to_be_so(tmp_path: Path) -> None:
             fish.status()
         assert why in str(caught.value)
         assert "start one" not in str(caught.value)
-        with zmq.Context() as context:
-            camera = CameraRequests(endpoint, context, 0.1)
-            with pytest.raises(CameraLost, match=re.escape(why)):
-                camera.status()
-            context.destroy(linger=0)
+        lost = pytest.raises(CameraLost, match=re.escape(why))
+        with CameraRequests(endpoint, 0.1) as camera, lost:
+            camera.status()
     with running(tmp_path) as daemon:
         fish = Fish(daemon.endpoint, timeout=0.1, telemetry="tcp://fish_1.invalid:9872")
         with fish, pytest.raises(NoDaemon, match=r"answers, but .*fish_1.invalid is not known"):
@@ -274,14 +271,11 @@ class DistantCamera(NamedTuple):
     @property
     def seq(self) -> int:
         """Number of the latest frame, requested without the path; 0 without an answer."""
-        with zmq.Context() as context:
-            requests = CameraRequests(f"tcp://{HOST}:{self.requests_port}", context, 1.0)
+        with CameraRequests(f"tcp://{HOST}:{self.requests_port}", 1.0) as requests:
             try:
                 return requests.status().seq
             except CameraLost:
                 return 0
-            finally:
-                context.destroy(linger=0)
 
 
 def last_frame(folder: Path) -> int:

@@ -24,8 +24,9 @@ MAX_GROWTH_PAGES = 2**19 // 4096
 
 
 def usage(daemon: Daemon) -> dict[str, tuple[int, int]]:
-    """Return number of open files and resident memory [pages] of fishd and of its gateways."""
-    processes = {"fishd": daemon.process.pid, **gateways(daemon)}
+    """Return number of open files and resident memory [pages] of fishd and its gateways."""
+    local, network = gateways(daemon)
+    processes = {"fishd": daemon.process.pid, "local": local, "network": network}
     return {
         name: (
             len(list(Path(f"/proc/{pid}/fd").iterdir())),
@@ -87,7 +88,6 @@ def test_a_thousand_unknown_keys_get_nothing_and_leave_nothing(tmp_path: Path) -
         start = daemon.status()
         for _ in range(2):  # what was needed at most at a time is kept, and serves the next tries
             before = usage(daemon)
-            assert sorted(before) == ["control", "fishd", "keyed-con", "keyed-tel", "telemetry"]
             for _ in range(TRIES // BATCH // 2):
                 for address, kind in sockets:
                     try_keys(rig, address, kind)

@@ -12,7 +12,7 @@ from rigs.camera_process import CameraProcess, running_camera
 from rigs.processes import Daemon, fishctl, running, sets
 from rigs.swimming import rows, while_it_trains
 
-from fishd.lab.links import fishd_link
+from fishd.learning.links import fishd_link
 
 if find_spec("torch") is None:
     pytest.skip("learning needs torch", allow_module_level=True)

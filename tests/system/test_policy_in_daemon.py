@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from rigs.policy_files import FLIP, card, linear, random_layers, write
-from rigs.processes import PATIENCE, Daemon, Subscriber, install, one_line, running, sets
+from rigs.processes import PATIENCE, Daemon, Subscriber, one_line, running
 
 from fishd.client import Fish
 from fishd.controllers.policy.network import to_onnx
@@ -159,35 +159,3 @@ def test_fishd_starts_with_a_policy_of_its_configuration(folder: Path, tmp_path:
     assert status == 78
     refused = f"{file}:4: start.parameters.policy: ppo: policy: no policy is named 'first'"
     assert f"fishd: {refused}" in errors
-
-
-WARMING = """
-from fishd.controllers.hold import Hold
-
-
-class Warming(Hold):
-    "Commands an angle that counts how often it has warmed up."
-
-    count = 0
-
-    def warm_up(self):
-        self.count += 1
-
-    def update(self, observation):
-        return 1e-3 * self.count
-"""
-
-
-def test_a_running_fishd_warms_up_its_controller(tmp_path: Path) -> None:
-    site = tmp_path / "site"
-    install(site, {"warming": WARMING}, warming="warming:Warming")
-    under = ("env", f"PYTHONPATH={site}")
-    warm = sets("realtime.warm_up=true")
-    with (
-        running(tmp_path, *warm, under=under) as daemon,
-        Subscriber(daemon.telemetry, b"tick") as ticks,
-    ):
-        daemon.fishctl("set-controller", "warming")
-        ticks.until(controller="warming")
-        while ticks.message()["phi_c"] < 5.5e-3:  # the warm-up is left out if time is short
-            pass

@@ -11,9 +11,9 @@ from rigs.camera_process import CameraProcess, running_camera
 from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line, wait_until
 
 from fishd.cli.recording.record import INCOMPLETE
+from fishd.core.camera_frames import FrameHead
 from fishd.core.errors import RecordingError
 from fishd.recording import open_run
-from fishd.recording.images import FrameHead
 
 
 @pytest.fixture

@@ -7,9 +7,9 @@ from rigs.processes import EXPERIMENT, PATIENCE, Daemon, Process, wait_until
 
 from fishd.client import Fish
 from fishd.core.errors import RecordingError
+from fishd.lab.rerun import rerun
 from fishd.lab.session import LiveSession
 from fishd.recording import open_run
-from fishd.recording.rerun import rerun
 
 
 def test_what_a_live_rig_does_is_rerun_to_the_last_bit(daemon: Daemon, tmp_path: Path) -> None:

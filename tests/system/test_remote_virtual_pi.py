@@ -7,7 +7,7 @@ import pytest
 from rigs.processes import running
 from rigs.virtual_pi_process import virtual_pi
 
-from fishd.lab.links.fishd_link import FishdLink
+from fishd.learning.links.fishd_link import FishdLink
 
 
 @pytest.mark.realtime

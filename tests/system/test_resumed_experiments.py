@@ -16,7 +16,7 @@ pytestmark = pytest.mark.realtime
 
 def rows(folder: Path) -> list[dict[str, str]]:
     """Return the finished swims and rests of an experiment; none without a table."""
-    path = folder / "rows.csv"
+    path = folder / "swims.csv"
     return list(csv.DictReader(path.read_text().splitlines())) if path.exists() else []
 
 

@@ -53,7 +53,7 @@ def test_it_says_where_it_listens_and_answers_there(own_pi: Pi) -> None:
         assert remote.transfer(0x48, CONFIG) == [b"\x85\x83"]
     status = json.loads(own_pi.control("status", "--json"))
     assert status["pigpio_port"] == own_pi.port
-    assert (status["pulse"], status["angle"], status["faults"]) == (0.0, None, {})
+    assert (status["pulse"], status["phi_c"], status["faults"]) == (0.0, None, {})
 
 
 def test_a_pulse_moves_the_fish(own_pi: Pi) -> None:

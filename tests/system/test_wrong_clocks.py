@@ -29,7 +29,7 @@ class Rig:
         self.environment = {
             **os.environ, **self.clock.environment, "FISHD_RUNS": str(self.runs)
         }  # fmt: skip
-        self.fishd = Fishd("realtime.warm_up=false", environment=self.clock.environment)
+        self.fishd = Fishd(environment=self.clock.environment)
 
     def words(self, *words: str) -> list[str]:
         return [FISHCTL, *words, "--endpoint", self.fishd.endpoint]

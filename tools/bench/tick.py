@@ -212,6 +212,12 @@ def goals(results: Results) -> list[list[str]]:
         judged("busy time p50 ≤ 100 µs", 100, us, lambda r: r.fishd.timing.duration.p50),
         judged("busy time p99 ≤ 250 µs", 250, us, lambda r: r.fishd.timing.duration.p99),
         judged(
+            "processor time of a tick, with a subscriber ≤ 0.8 ms",
+            0.8,
+            "{:.2f} ms",
+            lambda r: 1e3 * r.tick * r.fishd.cpu,
+        ),
+        judged(
             "2 ms tick, < 0.1 % missed", 1e-3, "{:.3%}", lambda r: r.lateness[0].missed, tick=FAST
         ),
         judged("RSS ≤ 62 MB", 62, "{:.0f} MB", lambda r: r.fishd.rss),

@@ -111,24 +111,21 @@ class Fishd(Process):
         self.process.wait(TIMEOUT_S)
         return time.monotonic() - begun
 
-    def gateways(self) -> list[int]:
-        """Return the process of the gateways' fork server, then those of the gateways."""
-        servers = list_children(self.pid)
-        return [*servers, *(pid for server in servers for pid in list_children(server))]
-
     def cpu_seconds(self) -> float:
-        """Return the user and system time of all threads and of the gateways [s]."""
-        return sum(_cpu_seconds(Path(f"/proc/{pid}")) for pid in (self.pid, *self.gateways()))
+        """Return the user and system time of all threads and of the gateway [s]."""
+        return sum(_cpu_seconds(Path(f"/proc/{pid}")) for pid in self.processes())
+
+    def processes(self) -> list[int]:
+        """Return the processes of fishd and of its gateways."""
+        return [self.pid, *list_children(self.pid)]
 
     def memory(self, field: str = "VmRSS") -> float:
         """Return a size of the main process in /proc/PID/status [MB]."""
         return _size(Path(f"/proc/{self.pid}/status"), field)
 
     def total_memory(self) -> float:
-        """Return the memory of fishd and its gateways, shared pages counted once (PSS) [MB]."""
-        return sum(
-            _size(Path(f"/proc/{pid}/smaps_rollup"), "Pss") for pid in (self.pid, *self.gateways())
-        )
+        """Return the memory of fishd and its gateway, shared pages counted once (PSS) [MB]."""
+        return sum(_size(Path(f"/proc/{pid}/smaps_rollup"), "Pss") for pid in self.processes())
 
 
 @contextlib.contextmanager

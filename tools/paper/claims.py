@@ -245,13 +245,8 @@ def learning() -> Iterator[Claim]:
 
 
 def swimming() -> Iterator[Claim]:
-    """Return the claims on the free swimmer, for each reading of the paper."""
-    for fish in figure_6.READINGS:
-        yield from _swimming(fish)
-
-
-def _swimming(fish: str) -> Iterator[Claim]:
-    fastest_waves = list(figure_6.fastest(fish))
+    """Return the claims on the free swimmer."""
+    fastest_waves = list(figure_6.fastest())
     if not fastest_waves:  # without results yet
         return
     best = ", ".join(
@@ -259,16 +254,16 @@ def _swimming(fish: str) -> Iterator[Claim]:
         for frequency, first, alike in fastest_waves
     )
     yield Claim(
-        f"the square wave is the fastest at every frequency: {fish}",
+        "the square wave is the fastest at every frequency",
         f"the fastest, within the intervals: {best}",
         all(first == "square" and not alike for _, first, alike in fastest_waves),
     )
-    waves = [row for wave in figure_6.WAVES for row in _swum(fish, wave)]
+    waves = [row for wave in figure_6.WAVES for row in _swum(wave)]
     top = max(waves, key=lambda row: row["speed_mm_per_s"])
-    for row in _swum(fish, "swing"):
+    for row in _swum("swing"):
         share = row["speed_mm_per_s"] / top["speed_mm_per_s"]
         yield Claim(
-            f"swing with C = 0 is close to the maximum: {fish}"
+            "swing with C = 0 is close to the maximum"
             if row["setting"] == 0.0
             else "… and with C = 0.6",
             f"{_speed(row)} mm/s at "
@@ -279,7 +274,7 @@ def _swimming(fish: str) -> Iterator[Claim]:
         )
     swings = [0.5 * row["tail_side_to_side_over_L"] for row in waves]
     yield Claim(
-        f"tail amplitude of about 0.2 L: {fish}",
+        "tail amplitude of about 0.2 L",
         f"{min(swings):.2f} to {max(swings):.2f} L to either side while it swims; the muscles "
         "alone bend it by 0.21 L",
         None,
@@ -289,13 +284,14 @@ def _swimming(fish: str) -> Iterator[Claim]:
 def _speed(row: dict[str, Any]) -> str:
     """Return speed ± averaging, and ± grid where that is known."""
     text = f"{row['speed_mm_per_s']:.2f} ± {row['ci95_mm_per_s']:.2f}"
-    case = figure_6.Case(row["fish"], row["controller"], row["setting"], row["cell_mm"])
-    error = case.grid_error()
+    case = figure_6.Case(row["controller"], row["setting"], row["cell_mm"])
+    error = figure_6.TABLE.grid_error(*case)
     return text if error is None else f"{text} ± {error:.0f}"
 
 
-def _swum(fish: str, controller: str) -> list[dict[str, Any]]:
-    return read(figure_6.NAME, fish=fish, controller=controller, cell_mm=figure_6.CELL)
+def _swum(controller: str) -> list[dict[str, Any]]:
+    stored = figure_6.TABLE
+    return read(stored.name, controller=controller, cell_mm=stored.cell)
 
 
 def _steps(policy: str) -> int:

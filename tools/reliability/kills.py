@@ -70,7 +70,7 @@ class Lane:
             "force_sensor.data_rate=128",  # a low load on a busy machine
             f"servo.timeout={timeout}",
             "start.controller=square",
-            *("realtime.priority=0", "realtime.lock_memory=false", "realtime.warm_up=false"),
+            *("realtime.priority=0", "realtime.lock_memory=false"),
             command=self._command,
         )
         return self.fishd

@@ -34,7 +34,7 @@ protocol.LOADING_TIMEOUT_S = {loading}
 from fishd.__main__ import fishd
 fishd()
 """
-METHODS = ("check", "__init__", "activate", "update", "warm_up", "retune", "close")
+METHODS = ("check", "__init__", "activate", "update", "retune", "close")
 DEAD_LINE = 'raise SystemExit("no")\n'
 HANGING_LINE = "import threading\n\nthreading.Event().wait()\n"
 
@@ -115,7 +115,7 @@ def survives(fishd: Fishd, fish: Fish, method: str, deed: str) -> bool:
     try:
         try:
             fish.set_controller("zoo", deed=deed, method=method)
-            if method in ("activate", "update", "warm_up"):
+            if method in ("activate", "update"):
                 await_mode(fish, "fault")
             elif method == "retune":
                 fish.set_parameters(nudge=1)
@@ -126,7 +126,6 @@ def survives(fishd: Fishd, fish: Fish, method: str, deed: str) -> bool:
             if refusal.code not in ("controller-error", "bad-parameter") or method in (
                 "activate",
                 "update",
-                "warm_up",
                 "close",
             ):
                 return False

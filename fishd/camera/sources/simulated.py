@@ -65,7 +65,7 @@ class FishDescription(NamedTuple):
     lockstep: bool
 
 
-class Foresight:
+class MotionPrediction:
     """Prediction of the tail's motion from each tick to the next."""
 
     def __init__(self, description: FishDescription) -> None:
@@ -189,7 +189,7 @@ class _View:
     ) -> None:
         self._settings = settings
         self._camera = SimulatedCamera(settings, size)
-        self._foresight = Foresight(description)
+        self._prediction = MotionPrediction(description)
         self._description = description
         self._sink = sink
         self._due: deque[Shot] = deque()
@@ -222,13 +222,13 @@ class _View:
         elif tick.seq > self._last_seq + 1:
             self._sink.lost(dropped=self._frames_in(tick.seq - self._last_seq - 1))
         self._last_seq = tick.seq
-        for before, after in self._foresight.follow(tick):
+        for before, after in self._prediction.follow(tick):
             for frame in self._camera.frames(before, after):
                 self._due.append(Shot(*frame, self._settings.exposure))
         if self._description.lockstep:
             while self._due:
                 self._sink.put(self._due.popleft())
-            self._sink.covered(self._foresight.end)
+            self._sink.covered(self._prediction.end)
 
     def publish(self) -> None:
         """Put the frames that are due."""

@@ -146,14 +146,14 @@ def _request_with_help(ask: Callable[[], T], loads: Path | None) -> T:
 
 def _explain_doubtful_sign(
     reversed_now: bool | None, present: ForceCalibration, new: ForceCalibration
-) -> str:
-    """Return why the last motion of the tail contradicts the sign of F_y; empty if it does not.
+) -> str | None:
+    """Return why the last motion of the tail contradicts the sign of F_y; None if it does not.
 
     reversed_now: whether F_y is reversed with the present calibration; None if not known
     """
     same_sign = present.yx * new.yx + present.yy * new.yy > 0.0
     if reversed_now is None or same_sign is not reversed_now:
-        return ""
+        return None
     if reversed_now:
         return (
             "F_y is reversed, as the last start of the tail has shown, and this calibration leaves "

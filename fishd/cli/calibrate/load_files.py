@@ -30,11 +30,11 @@ class Step(NamedTuple):
     """Unit of the forces in the file."""
 
 
-def explain_excess(fx: float, fy: float, limit: float) -> str:
-    """Return why a load [N] is outside ±`limit` of the sensor; empty if it is inside."""
+def explain_excess(fx: float, fy: float, limit: float) -> str | None:
+    """Return why a load [N] is outside ±`limit` of the sensor; None if it is inside."""
     largest = max(fx, fy, key=abs)
     if abs(largest) <= limit:
-        return ""
+        return None
     return f"{largest:.4g} N is beyond force_sensor.force_limit, {limit:g} N"
 
 

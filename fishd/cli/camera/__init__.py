@@ -8,7 +8,7 @@ VERBS = {
     "Look": {
         "status": Verb("camera.look", "status", "Show the state of the camera."),
         "view": Verb("camera.look", "view", "Show its picture in the terminal, or write a PNG."),
-        "page": Verb("camera.look", "page", "Show its picture live on a web page."),
+        "page": Verb("camera.page", "page", "Show its picture live on a web page."),
     },
     "Set up": {
         "align": Verb("camera.align", "align", "Find the axis of motion, and how to turn it."),

@@ -109,8 +109,8 @@ def _film_swim(client: "CameraClient", fish: "Fish", seconds: float) -> list["Fr
     refuse_lockstep(client.state.virtual)
     with open_session(fish, seconds) as rig, show_progress(seconds, "s") as bar:
         watcher = Watcher(client, bar.at)
-        rig.listener = watcher
-        rig.swim("swing", {}, seconds)
+        with rig.heard_by(watcher):
+            rig.swim("swing", {}, seconds)
     if not watcher.frames:
         client.check()
         raise FishdError(f"no frame has come from {client.state.frames} while it swam")

@@ -53,8 +53,8 @@ def latency(address: str | None, endpoint: str | None, seconds: float, as_json: 
         try:
             with open_session(fish, seconds) as rig, show_progress(seconds, "s") as bar:
                 watcher = Watcher(client, bar.at)
-                rig.listener = watcher
-                rig.swim("excitation", {}, seconds)
+                with rig.heard_by(watcher):
+                    rig.swim("excitation", {}, seconds)
         except KeyboardInterrupt:
             echo("fishctl: interrupted: the fish rests, nothing is measured", err=True)
             return INTERRUPTED

@@ -1,11 +1,9 @@
-"""The verbs that show a camera: its state, and its picture in the terminal or on a web page."""
+"""The verbs that show a camera: its state, and its picture in the terminal."""
 
-import asyncio
 import datetime
 import os
 import signal
 import sys
-import threading
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -24,8 +22,7 @@ from fishd.cli.output import (
     print_json_line,
 )
 from fishd.cli.progress import open_full_screen
-from fishd.core.errors import FishdError, StartupError
-from fishd.core.process.interruption import on_signal
+from fishd.core.errors import FishdError
 
 if TYPE_CHECKING:
     from fishd.camera.axis import AxisWatch
@@ -39,9 +36,6 @@ AXIS_SEARCH_S = 8.0
 """Duration of the search for an axis [s]."""
 REDRAW_INTERVAL_S = 0.2
 """Shortest time from one drawing to the next [s]."""
-DEFAULT_PORT = 9876
-JOIN_TIMEOUT_S = 1.0
-"""Longest wait for the thread of the camera at the end [s]."""
 
 
 @click.command()
@@ -49,16 +43,10 @@ JOIN_TIMEOUT_S = 1.0
 @json_option
 def status(address: str | None, as_json: bool) -> None:
     """Show the state of the camera and its beginning, the rate, the age of frames, and losses."""
-    import zmq
-
     from fishd.camera.requests import CameraRequests, find_camera
 
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    try:
-        requests = CameraRequests(address or find_camera(), context, ANSWER_TIMEOUT_S)
+    with CameraRequests(address or find_camera(), ANSWER_TIMEOUT_S) as requests:
         state = requests.status()
-    finally:
-        context.destroy(linger=0)
     if as_json:
         print_json(state)
     else:
@@ -144,7 +132,7 @@ def view(
             from fishd.cli.camera.terminal import TerminalPicture
 
             console = Console()
-            console.print(TerminalPicture(_draw_picture(client, watch, whole)))
+            console.print(TerminalPicture(draw_picture(client, watch, whole)))
             echo(format_facts(client, watch))
         else:
             echo(format_facts(client, watch))
@@ -217,7 +205,7 @@ def _follow(client: "CameraClient", watch: "AxisWatch", whole: bool, as_json: bo
 
     with open_full_screen() as live:
         while True:
-            drawing = TerminalPicture(_draw_picture(client, watch, whole))
+            drawing = TerminalPicture(draw_picture(client, watch, whole))
             live.update(
                 Group(drawing, Text(format_facts(client, watch), no_wrap=True)), refresh=True
             )
@@ -234,7 +222,8 @@ def _read_for(client: "CameraClient", watch: "AxisWatch", seconds: float) -> Non
         watch.find()
 
 
-def _draw_picture(client: "CameraClient", watch: "AxisWatch", whole: bool) -> "Colours":
+def draw_picture(client: "CameraClient", watch: "AxisWatch", whole: bool) -> "Colours":
+    """Return the latest picture with the axis; whole: that of the camera, not only the crop."""
     from fishd.camera import drawing
 
     assert client.latest
@@ -250,77 +239,9 @@ def _draw_picture(client: "CameraClient", watch: "AxisWatch", whole: bool) -> "C
 def _write_png(client: "CameraClient", watch: "AxisWatch", whole: bool, png: Path) -> None:
     from fishd.camera import drawing
 
-    colours = _draw_picture(client, watch, whole)
+    colours = draw_picture(client, watch, whole)
     drawing.write_png(png, colours if whole else drawing.enlarge(colours))
 
 
 def _can_draw() -> bool:
     return sys.stdout.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
-
-
-@click.command()
-@camera_option
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=DEFAULT_PORT,
-    show_default=True,
-    help="Port of the page; 0: any.",
-)
-@click.option(
-    "--host",
-    default="127.0.0.1",
-    show_default=True,
-    metavar="ADDRESS",
-    help="Address of the page. The default is for this machine only; with another one, every "
-    "computer that reaches it can see the pictures.",
-)
-@json_option
-def page(address: str | None, port: int, host: str, as_json: bool) -> None:
-    """Show what the camera sees on a web page, live, with the axis of motion, until Ctrl-C.
-
-    It needs nothing from the internet, and accepts no request that changes anything.
-    """
-    with suppress(KeyboardInterrupt):
-        asyncio.run(_serve(address, host, port, as_json))
-
-
-async def _serve(address: str | None, host: str, port: int, as_json: bool) -> None:
-    from fishd.window.camera_page.feed import Feed, News
-    from fishd.window.camera_page.server import PageServer
-
-    loop, ended = asyncio.get_running_loop(), asyncio.Event()
-    failures: list[BaseException] = []
-    server = PageServer(host, port)
-
-    def tell(news: News) -> None:
-        with suppress(RuntimeError):  # the loop has ended
-            loop.call_soon_threadsafe(server.show, news)
-
-    feed = Feed(address, tell)
-
-    def follow() -> None:
-        try:
-            feed.run()
-        except BaseException as error:
-            failures.append(error)
-            with suppress(RuntimeError):
-                loop.call_soon_threadsafe(ended.set)
-
-    thread = threading.Thread(target=follow, name="camera", daemon=True)
-    try:
-        async with server:
-            with on_signal(lambda: loop.call_soon_threadsafe(ended.set)):
-                thread.start()
-                if as_json:
-                    print_json_line({"url": server.url})
-                else:
-                    echo(f"the camera is at {server.url}; Ctrl-C ends it")
-                await ended.wait()
-            feed.stop()
-            await asyncio.to_thread(thread.join, JOIN_TIMEOUT_S)
-    except StartupError:
-        feed.close()
-        raise
-    if failures:
-        raise failures[0]

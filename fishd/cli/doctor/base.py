@@ -14,7 +14,7 @@ from fishd import assembly
 from fishd.client import Fish
 from fishd.client.connection import DEFAULT_TIMEOUT_S
 from fishd.config import Config
-from fishd.config.drivers import CHOICES
+from fishd.config.drivers import choice_of, name_of
 from fishd.core import local_daemons
 from fishd.core.addresses import find_control_address, socket_path
 from fishd.core.errors import FishError, NoDaemon, Refused, StartupError, Untrusted
@@ -149,6 +149,20 @@ def _read_calibrations(fish: Fish) -> Calibrations | None:
         return None
 
 
+class ChosenDriver(NamedTuple):
+    """A driver that the configuration chooses."""
+
+    section: str
+    """Section of its keys, such as `servo` or `sensors.water`."""
+    plugins: Plugins[Any]
+    name: str
+    settings: Any
+
+    def find(self) -> Any:
+        """Return its class; raise `UnknownDriver` if it does not load."""
+        return self.plugins.find(self.name)
+
+
 @dataclass
 class Context(Machine):
     """Context of the checks: this machine, the configuration and a daemon, if one runs."""
@@ -235,10 +249,12 @@ class Context(Machine):
             yield
 
     @property
-    def drivers(self) -> tuple[tuple[str, Plugins[Any], Any], ...]:
-        """Section, plugins and settings of each driver: sensor, servo, and a power meter if any."""
-        sections = self.config.driver_settings.sections()
-        return tuple((name, CHOICES[name].plugins, settings) for name, settings in sections.items())
+    def drivers(self) -> tuple[ChosenDriver, ...]:
+        """Drivers of the force sensor, the servo, and any other sensors."""
+        return tuple(
+            ChosenDriver(section, choice_of(section).plugins, name_of(section, settings), settings)
+            for section, settings in self.config.driver_settings.sections().items()
+        )
 
 
 def sudo_unless(uid: int) -> str:

@@ -6,13 +6,15 @@ While a fishd runs, they ask it and leave its hardware alone.
 import os
 import re
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, closing
+from typing import Any
 
 from fishd.assembly import open_sensor
-from fishd.cli.doctor.base import Context
+from fishd.cli.doctor.base import ChosenDriver, Context
 from fishd.config.drivers import claims_of
 from fishd.core.clock import SystemClock
+from fishd.core.console import format_reading
 from fishd.core.errors import ConfigError, MissingPackage, SensorError, ServoError, StartupError
 from fishd.hardware.checks import (
     START_VIRTUAL_PI,
@@ -24,40 +26,79 @@ from fishd.hardware.checks import (
     skipped,
     warning,
 )
+from fishd.hardware.driver import SensorDriver
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.hardware.registry import FORCE_SENSORS, SERVOS, driver_packages
 from fishd.hardware.servo import pulses
 
 TRIAL_S = 1.0
-"""Duration of the trial of the sensor [s]."""
+"""Duration of the trial of the force sensor [s]."""
+SENSOR_TIMEOUT_S = 5.0
+"""Longest wait for the first sample of another sensor [s]."""
 _DEBUG = "/sys/kernel/debug"
 _GPIO_LINE = re.compile(r"\(GPIO(?P<pin>\d+)\s*\|(?P<user>[^)]*?)\s*\)")
 
 
 def checks(context: Context) -> tuple[Check, ...]:
     """Return all checks, for the drivers of the configuration."""
-    (_, sensor, sensor_settings), (_, servo, servo_settings), *meters = context.drivers
-    servo_checks = servo.find(servo_settings.driver).checks(servo_settings)
+    sensor, servo, *others = context.drivers
     return (
         Check("drivers", drivers),
-        *sensor.find(sensor_settings.driver).checks(sensor_settings),
+        *sensor.find().checks(sensor.settings),
         Check("force", force),
-        *(servo_checks or (Check("servo", servo_opens),)),
-        *(
-            check
-            for _, meter, settings in meters
-            for check in meter.find(settings.driver).checks(settings)
-        ),
+        *(servo.find().checks(servo.settings) or (Check("servo", servo_opens),)),
+        *(check for other in others for check in other.find().checks(other.settings)),
+        *map(_sensor_check, others),
         Check("gpio pins", pins, on_this_machine),
     )
+
+
+def _sensor_check(sensor: ChosenDriver) -> Check:
+    """Return the check that a sensor gives readings."""
+    name = sensor.section.partition(".")[2]
+    return Check(name, lambda context: _sensor_answers(context, name, sensor))
+
+
+def _sensor_answers(context: Context, name: str, sensor: ChosenDriver) -> Result:
+    """Check that a sensor gives readings, by the running daemon or by its driver."""
+    if context.running:
+        states = {key: s for key, s in context.running[0].readings.items() if s.sensor == name}
+        problems = [state.problem for state in states.values() if state.problem]
+        values = [f"{key} {format_reading(s)}" for key, s in states.items() if s.value is not None]
+        if problems:
+            return fail(problems[0], "mend what this line says")
+        return ok(", ".join(values))
+    if occupied := context.occupied("reads it"):
+        return occupied
+    with driver_packages(sensor.name):
+        driver = sensor.find()(sensor.settings, SystemClock(), context.config.tick, sensor.section)
+    try:
+        with context.plugged_in(), closing(driver):
+            driver.open()
+            result: Result = driver.judge(_first_sample(driver))
+            return result
+    except StartupError as error:
+        return fail(str(error), START_VIRTUAL_PI)
+    except Exception as error:  # the libraries of drivers raise all kinds of exceptions
+        return fail(driver.explain(error), "mend what this line says")
+
+
+def _first_sample(driver: SensorDriver[Any]) -> Mapping[str, float]:
+    """Return the first sample of a sensor; raise TimeoutError if none is complete in time."""
+    start = time.monotonic()
+    while time.monotonic() - start < SENSOR_TIMEOUT_S:
+        if sample := driver.sample():
+            return sample
+        time.sleep(0.01)
+    raise TimeoutError(f"{driver.place} gave no sample for {SENSOR_TIMEOUT_S:g} s")
 
 
 def drivers(context: Context) -> Result:
     """Report each driver, and its package."""
     return ok(
         ", ".join(
-            f"{section} {settings.driver} of {plugins.package(settings.driver)}"
-            for section, plugins, settings in context.drivers
+            f"{driver.section} {driver.name} of {driver.plugins.package(driver.name)}"
+            for driver in context.drivers
         )
     )
 

@@ -4,7 +4,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import msgspec
-import zmq
 
 from fishd.cli.doctor.base import ANSWER_TIMEOUT_S, Context, Running, Unreachable, is_unused
 from fishd.core import addresses, local_daemons
@@ -103,14 +102,11 @@ def camera(context: Context) -> Result | None:
     with suppress(PermissionError):
         if is_unused(address):
             return None
-    zmq_context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     try:
-        client = requests.CameraRequests(address, zmq_context, ANSWER_TIMEOUT_S)
-        state = client.status()
+        with requests.CameraRequests(address, ANSWER_TIMEOUT_S) as client:
+            state = client.status()
     except (FishError, msgspec.MsgspecError) as error:
         return warning(str(error), "see what listens there, or restart fishd-camera")
-    finally:
-        zmq_context.destroy(linger=0)
     if state.state != "streaming":
         return warning(f"{state.state}: {state.problem}", state.remedy)
     lost = (

@@ -47,10 +47,10 @@ def packages(context: Context) -> Result:
     kind, requirements, drivers = context.config.kind, [], list[str]()
     texts, packages = list(metadata.requires("fishd") or []), set[str]()
     if kind.has_hardware:
-        for _, plugins, settings in context.drivers:
-            packages |= {name.lower() for name in plugins.find(settings.driver).packages}
-            texts += plugins.requirements(settings.driver)
-            drivers.append(settings.driver)
+        for driver in context.drivers:
+            packages |= {name.lower() for name in driver.find().packages}
+            texts += driver.plugins.requirements(driver.name)
+            drivers.append(driver.name)
     for text in texts:
         match = _REQUIREMENT.match(text)
         assert match
@@ -70,9 +70,7 @@ def packages(context: Context) -> Result:
 def gpio_package(context: Context) -> Result | None:
     """Check the packages with which drivers use pins of the header."""
     drivers = [
-        settings.driver
-        for _, plugins, settings in context.drivers
-        if header.PACKAGE in plugins.find(settings.driver).packages
+        driver.name for driver in context.drivers if header.PACKAGE in driver.find().packages
     ]
     installed = header.installed_packages()
     pip = f"{sys.executable} -m pip"
@@ -109,8 +107,8 @@ def gpio_chip(context: Context) -> Result | None:
         return fail(problem, remedy)
 
 
-def _find_problem(name: str, bounds: str) -> str:
-    """Return what is wrong with an installed package; empty if nothing is."""
+def _find_problem(name: str, bounds: str) -> str | None:
+    """Return what is wrong with an installed package; None if nothing is."""
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -125,7 +123,7 @@ def _find_problem(name: str, bounds: str) -> str:
         return f"{name} cannot be imported: {error}"
     except Exception as error:
         return f"{name} cannot be imported: {type(error).__name__}: {error}"
-    return ""
+    return None
 
 
 def _parse_version(version: str) -> list[int]:

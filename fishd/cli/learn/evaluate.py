@@ -1,7 +1,6 @@
 """The verb that lets policies and controllers swim many other fish."""
 
 import statistics
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +11,7 @@ from fishd.cli.completion import complete_contestant
 from fishd.cli.config import fish_options
 from fishd.cli.controller_arguments import ControllersCommand
 from fishd.cli.options import for_option, json_option, plot_option
-from fishd.cli.output import echo, print_json
+from fishd.cli.output import echo, echo_table, print_json
 from fishd.cli.progress import show_progress
 from fishd.config import load
 
@@ -20,9 +19,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from fishd.lab.compare.survey import ContestantSurvey, FishResult
-
-PIPE_COLUMNS = 1000
-"""Width of a table in a file or a pipe, so that nothing is wrapped [columns]."""
 
 
 @click.command(cls=ControllersCommand)
@@ -90,11 +86,7 @@ def evaluate(
     if as_json:
         print_json(surveys)
     else:
-        from rich.console import Console
-
-        Console(width=None if sys.stdout.isatty() else PIPE_COLUMNS, markup=False).print(
-            _build_table(surveys, singles)
-        )
+        echo_table(_build_table(surveys, singles))
     faults = [(surveyed, run) for surveyed in surveys for run in surveyed.fish if run.fault]
     for surveyed, run in faults:
         echo(f"fishctl: {surveyed.contestant}: {run.fish}: ended in fault: {run.fault}", err=True)

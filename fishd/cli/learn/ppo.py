@@ -12,8 +12,8 @@ from msgspec import to_builtins
 from msgspec.structs import replace
 
 from fishd.cli.config import config_option, set_option
+from fishd.cli.experiment import Ending
 from fishd.cli.experiment_options import (
-    ExperimentEnding,
     On,
     default_on,
     kept_arguments,
@@ -34,7 +34,7 @@ from fishd.cli.progress import show_progress
 from fishd.config import adopt, load
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import ConfigError
-from fishd.core.process.interruption import on_signal
+from fishd.core.process.interruption import Interrupted, on_signal
 
 if TYPE_CHECKING:
     from fishd.learning.train.jobs import Job, Outcome
@@ -227,8 +227,8 @@ def _prepare_job(
     Raises `ConfigError` and `CheckpointError`.
     """
     from fishd.lab.experiment import default_folder
-    from fishd.lab.links.fishd_link import config_of, plant_differences
     from fishd.learning import settings as training
+    from fishd.learning.links.fishd_link import config_of, plant_differences
     from fishd.learning.run_folder import checkpoints, runs
     from fishd.learning.train.jobs import Job
 
@@ -372,7 +372,6 @@ def _train_seeds(
 ) -> int:
     """Train all seeds, print a line as each ends, and a summary; return the exit status."""
     from fishd.lab.experiment import Header, open_experiment
-    from fishd.lab.workers import Unfinished
     from fishd.learning.train import seeds as training
 
     if not cluster and find_spec("torch") is None:  # only the training processes load it
@@ -388,11 +387,18 @@ def _train_seeds(
     outcomes: list[Outcome] = []
     with open_experiment(job.folder, header, resume=job.resume) as experiment:
         echo(f"{job.folder}: {seeds} seeds of {job.last_step()} steps", err=as_json)
-        ending = ExperimentEnding(experiment, cluster)
-        with ending.measuring(Unfinished):
+        ending = Ending(experiment, cluster)
+        with ending.measuring():
             outcomes = training.train_seeds(replace(job, resume=False), seeds, jobs, cluster, ended)
-        ends = {outcome.ended for outcome in outcomes}
-        ending.is_interrupted = ending.is_interrupted or "interrupted" in ends
+            if any(outcome.ended == "interrupted" for outcome in outcomes):
+                raise Interrupted
+        _print_seeds(job, outcomes, as_json)
+        finished = sum(outcome.ended == "finished" for outcome in outcomes)
+        ending.check(f"{finished} of {seeds} seeds are finished")
+    return 0 if finished == len(outcomes) else 1
+
+
+def _print_seeds(job: "Job", outcomes: "list[Outcome]", as_json: bool) -> None:
     if as_json:
         print_json(outcomes)
     for name, evaluations in (
@@ -407,10 +413,6 @@ def _train_seeds(
                 err=as_json,
             )
     echo(f"curves: {job.folder / 'seeds.csv'}", err=as_json)
-    if ending.is_interrupted:
-        finished = sum(outcome.ended == "finished" for outcome in outcomes)
-        return ending.interrupted(f"{finished} of {seeds} seeds are finished")
-    return 1 if ends - {"finished"} else 0
 
 
 def _print_seed(seed: int, outcome: "Outcome", err: bool) -> None:

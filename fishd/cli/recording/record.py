@@ -15,18 +15,18 @@ from msgspec.structs import asdict
 
 from fishd.cli.options import Utf8Text, endpoint_option, for_option, json_option
 from fishd.cli.output import echo, format_count, print_json
+from fishd.cli.prompts import caught_signals
 from fishd.cli.recording.files import folder_option
 from fishd.client import Fish
 from fishd.core import text
 from fishd.core.errors import FishError, NoDaemon, RecordingError
-from fishd.core.process.interruption import caught_signals
 from fishd.recording import RunWriter
 from fishd.recording.black_box import BlackBox
 from fishd.recording.folder import ensure_folder, open_new, recording_path, runs_folder
 from fishd.recording.recorder import MIN_FREE_BYTES, Position, Recorder
 
 if TYPE_CHECKING:
-    from fishd.recording.camera_tap import CameraTap
+    from fishd.camera.tap import CameraTap
 
 UNIT_BYTES = {"MB": 10**6, "GB": 10**9}
 INCOMPLETE = 3
@@ -148,7 +148,7 @@ def record(
     with ExitStack() as stack:
         tap = None
         if camera is not None:
-            from fishd.recording.camera_tap import CameraTap
+            from fishd.camera.tap import CameraTap
 
             tap = stack.enter_context(CameraTap(camera or None, endpoint))
         _record_one(run, endpoint, folder, begin, seconds, as_json, tap)

@@ -12,8 +12,8 @@ from fishd.cli.output import echo, format_controller, format_count, print_json
 from fishd.cli.recording.files import folder_option, open_recording
 from fishd.core import text
 from fishd.lab.compare.contestants import parse
-from fishd.recording.rerun import Estimates, Stretch
-from fishd.recording.rerun import rerun as choose_again
+from fishd.lab.rerun import Estimates, Stretch
+from fishd.lab.rerun import rerun as choose_again
 
 
 @click.command(cls=ControllersCommand)

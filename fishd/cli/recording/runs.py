@@ -1,7 +1,6 @@
 """The verb that lists recordings."""
 
 import shlex
-import sys
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import msgspec
 from msgspec import Struct
 
 from fishd.cli.options import json_option
-from fishd.cli.output import echo, format_count, print_json
+from fishd.cli.output import echo, echo_table, format_count, print_json
 from fishd.cli.recording.files import folder_option
 from fishd.core import text
 from fishd.core.console import format_power
@@ -26,7 +25,6 @@ from fishd.lab.experiment import (
 from fishd.recording.folder import Overview, read_overviews, runs_folder
 from fishd.recording.summary import Summary
 
-PIPE_COLUMNS = 1000
 MAX_DURATION_S = 1e9
 """Longest duration that is shown as hours and minutes, about thirty years [s]."""
 
@@ -120,7 +118,6 @@ def _find_state(path: Path, header: Header) -> str:
 
 
 def _print_experiments(experiments: list[_ExperimentSummary]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
@@ -139,7 +136,7 @@ def _print_experiments(experiments: list[_ExperimentSummary]) -> None:
             _format_thrust(experiment),
             _format_about(experiment),
         )
-    Console(width=None if sys.stdout.isatty() else PIPE_COLUMNS, markup=False).print(table)
+    echo_table(table)
 
 
 def _format_about(experiment: _ExperimentSummary) -> str:
@@ -161,7 +158,6 @@ def _to_json(glance: Overview) -> dict[str, Any]:
 
 
 def _print_recordings(recordings: list[Overview]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
@@ -177,15 +173,14 @@ def _print_recordings(recordings: list[Overview]) -> None:
             _format_start(glance.about.get("started", "")),
             _format_duration(summary.duration),
             _format_thrust(summary),
-            "–" if summary.power is None else format_power(summary.power),
+            format_power(summary.readings["power"]) if "power" in summary.readings else "–",
             str(summary.ticks),
             str(summary.lost_ticks),
             str(summary.marks),
             text.line(", ".join(summary.swim_ticks) or "–"),
             text.line("; ".join(_format_remarks(glance))),
         )
-    # Nothing is wrapped in a file or a pipe.
-    Console(width=None if sys.stdout.isatty() else PIPE_COLUMNS, markup=False).print(table)
+    echo_table(table)
 
 
 def _format_thrust(summary: "Summary | _ExperimentSummary") -> str:

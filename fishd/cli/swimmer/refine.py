@@ -9,8 +9,7 @@ import msgspec
 from fishd.cli.config import fish_options
 from fishd.cli.controller_arguments import ControllerGroup
 from fishd.cli.options import F, FiniteRange, json_option
-from fishd.cli.output import echo, echo_rows, format_controller, print_json
-from fishd.cli.swimmer.simulation import format_speed
+from fishd.cli.output import echo, echo_rows, format_controller, format_speed, print_json
 from fishd.config import load
 from fishd.controllers import registry
 from fishd.core import text

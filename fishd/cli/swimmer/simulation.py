@@ -12,9 +12,9 @@ import click
 from fishd.cli.controller_arguments import ControllerGroup
 from fishd.cli.experiment_options import RUN_ONLY_OPTIONS, kept_arguments, restore_arguments
 from fishd.cli.options import F, FiniteRange
-from fishd.cli.output import echo, echo_rows, format_controller, print_json
+from fishd.cli.output import echo, echo_rows, format_controller, format_speed, print_json
 from fishd.cli.progress import show_progress
-from fishd.core import files, text
+from fishd.core import files
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, ParameterError
 from fishd.core.process.interruption import on_signal
@@ -251,14 +251,6 @@ def _report_rows(report: "SwimReport") -> list[tuple[str, str]]:
             f"{report.real_time_factor:.3g} × real time",
         ),
     ]
-
-
-def format_speed(speed: float, ci95: float | None, grid_error: float | None) -> str:
-    """Return a speed with its errors by averaging and by the grid."""
-    value = text.format_measured(speed, ci95, "m/s")
-    if grid_error is None:
-        return f"{value}, grid error not known (fishctl swimmer refine)"
-    return f"{value}, {text.format_half_width(grid_error)} by the grid"
 
 
 def _trend_rows(report: "SwimReport") -> list[tuple[str, str]]:

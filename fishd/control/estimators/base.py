@@ -35,16 +35,16 @@ class TailBeat:
         self.frequency = 0.0
         """Frequency of the latest whole beats; 0 when not beating [Hz]."""
 
-    def update(self, angle: float, force: float, duration: float) -> None:
+    def update(self, instruction_angle: float, force: float, duration: float) -> None:
         """Add a window.
 
-        angle: instruction angle applied during the window [rad]
+        instruction_angle: instruction angle applied during the window [rad]
         force: mean longitudinal force of the window [N]
         duration: its length [s]
         """
         side = self._side
-        if angle:
-            side = 1.0 if angle > 0.0 else -1.0
+        if instruction_angle:
+            side = 1.0 if instruction_angle > 0.0 else -1.0
             elapsed = duration
             if side * self.side_time > 0.0:
                 elapsed += side * self.side_time
@@ -101,7 +101,7 @@ class Estimator(ABC):
         self.found_leak: float | None = None
         """Leak time in use [s], if the estimator finds it; else None."""
         self._fy: float | None = None
-        self._angle: float | None = None
+        self._instruction_angle: float | None = None
         self._beat = TailBeat()
 
     def rest(self) -> None:
@@ -140,8 +140,8 @@ class Estimator(ABC):
         fy_rate = (fy - self._fy) / dt if self._fy is not None else 0.0
         if measurement.samples:
             self._fy = fy
-        before = instruction_angle if self._angle is None else self._angle
-        self._angle = instruction_angle
+        before = instruction_angle if self._instruction_angle is None else self._instruction_angle
+        self._instruction_angle = instruction_angle
         self._beat.update(instruction_angle, measurement.fx, dt)
         return Observation(
             time=time,

@@ -137,8 +137,8 @@ class LateralSign:
 class _Push:
     """The push of F_y since the tail started to move."""
 
-    def __init__(self, angle: float, level: float, noise: float, rested: float) -> None:
-        self._side = math.copysign(1.0, angle)
+    def __init__(self, instruction_angle: float, level: float, noise: float, rested: float) -> None:
+        self._side = math.copysign(1.0, instruction_angle)
         self._level, self._noise, self._rested = level, noise, rested
         self._over = False
         self._time = self._pushed = self._lasted = 0.0

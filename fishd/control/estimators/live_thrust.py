@@ -78,7 +78,7 @@ class LiveThrust:
         """Noise of a swim while it swims, else of a rest."""
         self._swims = self._recording = False
         self._wave: Wave = ("", {})
-        self._now = self._phase = self._still = self._angle = self._side = 0.0
+        self._now = self._phase = self._still = self._instruction_angle = self._side = 0.0
         self._settling_since = -math.inf
         self._block = _Block()
         self._shown: deque[_Block] = deque()
@@ -135,17 +135,17 @@ class LiveThrust:
         running: whether a controller is active
         wave: the active controller and its parameters; a new object after each change
         """
-        angle, self._now = seen.instruction_angle, seen.time
-        self._still = 0.0 if angle != self._angle else self._still + seen.dt
-        self._angle = angle
+        instruction_angle, self._now = seen.instruction_angle, seen.time
+        self._still = 0.0 if instruction_angle != self._instruction_angle else self._still + seen.dt
+        self._instruction_angle = instruction_angle
         swims = running and self._still < REST_DELAY_S
         if swims is not self._swims or (swims and wave is not self._wave):
             self._change(swims, wave)
         self._phase += seen.dt
         side = self._side
-        if swims and angle:
-            self._side = angle
-        if not swims or side < 0.0 < angle:
+        if swims and instruction_angle:
+            self._side = instruction_angle
+        if not swims or side < 0.0 < instruction_angle:
             # The angle of this window follows a reversal: the beat ended with the window before.
             if self._recording:
                 self._block.beats += 1

@@ -1,7 +1,7 @@
 """Fin velocity in rad/s, from the lateral force and a model of the fish: a Kalman filter.
 
-The model is the fish of section `plant`, which receives the commands of the robot: servo, delay and
-play are known functions of the commands. The lateral force corrects the errors of the model. Fin
+The model is the fish of section `plant`, which receives the instruction angles of the robot: servo,
+delay and play are known functions of them. The lateral force corrects the errors of the model. Fin
 angle, fin velocity and the offset of the sensor are the state. The fin is linear, so their errors
 obey linear equations, and the filter is exact for windows of any length.
 """

@@ -5,8 +5,9 @@ another tick, for another amplitude or on other pictures than those of its train
 """
 
 import math
+from collections.abc import Sequence
 from operator import attrgetter
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 import numpy as np
@@ -16,8 +17,15 @@ from numpy.typing import NDArray
 from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import PolicyError
 from fishd.core.files import MAX_SETTINGS_BYTES
-from fishd.core.schema import Problem, convert, format_literal, nested_too_deeply
+from fishd.core.schema import (
+    Problem,
+    convert,
+    format_excerpt,
+    format_literal,
+    nested_too_deeply,
+)
 from fishd.core.signals import Observation
+from fishd.core.text import quoted
 
 CARD_KEY = "fishd.card"
 """Key of the card in the metadata of an ONNX file."""
@@ -36,6 +44,10 @@ FeatureName = Literal[
 ]
 """Fields of `Observation` that a policy may use."""
 
+FEATURE_NAMES: tuple[FeatureName, ...] = get_args(FeatureName)
+READING = "readings."
+"""Prefix of the name of an input that is a reading of a sensor, as `readings.flow`."""
+
 COMMAND_FEATURES = ("instruction_angle", "previous_angle", "side_time")
 """Features that are known without a sensor."""
 
@@ -48,12 +60,25 @@ Positive = Annotated[float, Meta(ge=1e-30, le=1e30)]
 """Positive number in the range of a float32, like its inverse."""
 
 
-class Feature(Struct, frozen=True, forbid_unknown_fields=True):
+class Feature(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """One input of the network."""
 
-    name: FeatureName
+    name: str
+    """Name of a field of `Observation`, or `readings.NAME` for a reading of a sensor."""
     scale: Positive
-    """Value that becomes 1 in the network's input, in the unit of the observation's field."""
+    """Difference from `offset` that becomes 1 in the network's input, in the unit of the value."""
+    offset: Annotated[float, Meta(ge=-1e30, le=1e30)] = 0.0
+    """Value that becomes 0, for a reading."""
+
+    @property
+    def reading(self) -> str:
+        """Name of the reading; empty for a field of the observation."""
+        return self.name.removeprefix(READING) if self.name.startswith(READING) else ""
+
+
+def is_even(name: str) -> bool:
+    """Return whether an input of this name is the same for the mirrored fish."""
+    return name == "fx" or name.startswith(READING)
 
 
 class Window(Struct, frozen=True):
@@ -72,7 +97,8 @@ class History:
 
     Ticks before the beginning equal the first one. A tick with the time of the latest replaces it.
     A tick that is older, or newer by more than the window, restarts the history, such as after a
-    reset, a pause or a gap.
+    reset, a pause or a gap. A reading that is old keeps its latest value; before the first one, its
+    input is 0.
     """
 
     def __init__(
@@ -88,11 +114,19 @@ class History:
         self._inputs = [
             (place, attrgetter(feature.name), 1.0 / feature.scale)
             for place, feature in enumerate(features)
+            if not feature.reading
+        ]
+        self._readings = [
+            (place, feature.reading, feature.offset, 1.0 / feature.scale)
+            for place, feature in enumerate(features)
+            if feature.reading
         ]
         self._window = window
         self.row = np.zeros(window.ticks * len(features), np.float32) if row is None else row
         """Input of the network, dimensionless: each feature divided by its scale."""
         self._ticks = self.row.reshape(window.ticks, len(features))
+        for place, *_ in self._readings:
+            self._ticks[:, place] = 0.0
         self._time = -math.inf
 
     def forget(self) -> None:
@@ -107,6 +141,9 @@ class History:
         newest = rows[0]
         for place, value, factor in self._inputs:
             newest[place] = value(observation) * factor
+        for place, name, offset, factor in self._readings:
+            if name in observation.readings:
+                newest[place] = (observation.readings[name] - offset) * factor
         if not 0.0 <= elapsed < self._window.span:
             rows[1:] = newest
         self._time = observation.time
@@ -166,14 +203,29 @@ class Card(Struct, frozen=True, kw_only=True):
 
     @property
     def sees(self) -> str:
-        """Inputs that depend on the fish: `forces`, `pictures` or both; commands do not count."""
-        forces = any(feature.name not in COMMAND_FEATURES for feature in self.observation)
+        """Inputs that show the fish: `forces`, `pictures` or both; not readings and past angles."""
+        forces = any(
+            feature.name in FEATURE_NAMES and feature.name not in COMMAND_FEATURES
+            for feature in self.observation
+        )
         if self.pictures is None:
             return "forces"
         return "forces, pictures" if forces else "pictures"
 
-    def check_fit(self, tick: float, amplitude: float) -> None:
-        """Raise `PolicyError` unless it can run on a robot with this tick [s] and Φ [rad]."""
+    def check_fit(
+        self, tick: float, amplitude: float, readings: Sequence[str] | None = None
+    ) -> None:
+        """Raise `PolicyError` unless it can run on a robot with this tick [s] and Φ [rad].
+
+        readings: names of the readings of its sensors; None if they are unknown
+        """
+        for feature in self.observation:
+            if feature.reading and readings is not None and feature.reading not in readings:
+                raise PolicyError(
+                    f"it needs the reading {quoted(feature.reading)}, which this robot does "
+                    f"not have; it has {', '.join(readings) or 'none'}: add a sensor to sensors, "
+                    "or rename one of its readings"
+                )
         if abs(self.tick - tick) > TICK_TOLERANCE_S:
             raise PolicyError(
                 f"it was trained at a tick of {self.tick * 1e3:g} ms, this robot's is "
@@ -219,6 +271,12 @@ def decode(text: str) -> Card:
         card = convert(data, Card)
     except Problem as problem:
         raise PolicyError(f"its card: {'.'.join(problem.path)}: {problem}") from None
+    for feature in card.observation:
+        if feature.name not in FEATURE_NAMES and not feature.reading:
+            raise PolicyError(
+                f"its card: observation.name: {format_excerpt(feature.name)} is not valid: one of "
+                f"{' | '.join(FEATURE_NAMES)}, or {READING}NAME, is needed"
+            )
     if not card.observation and card.pictures is None:
         raise PolicyError("its card names neither an observation nor pictures")
     return card

@@ -17,7 +17,6 @@ if TYPE_CHECKING:  # numpy and onnxruntime are imported with the first policy
     from fishd.controllers.policy.card import Card
     from fishd.controllers.policy.runtime import Network
 
-_WARM_UPS = 3
 ROUNDING = 1e-5
 """Largest output of a network that counts as zero, since its sums are rounded."""
 
@@ -57,18 +56,17 @@ class Ppo(Controller[PpoParameters]):
 
     def __init__(self, parameters: PpoParameters, limits: Limits) -> None:
         """Read, check and warm up the policy."""
-        from fishd.controllers.policy.card import History
+        from fishd.controllers.policy.card import History, is_even
 
         self.parameters = parameters  # without super(), which would read the policy twice
         self.limits = limits
         card, self._network = _open(parameters, limits)
         self._history = History(card.observation, card.window, self._network.row)
         names = [feature.name for feature in card.observation] * card.history
-        self._odd = [index for index, name in enumerate(names) if name != "fx"]
+        self._odd = [index for index, name in enumerate(names) if not is_even(name)]
         """Indices of the inputs that change sign for a mirrored fish."""
         self._amplitude = card.amplitude
         self._limit = DwellLimit(limits.dwell, limits, card.amplitude)
-        self._latest = Observation(0.0, limits.tick, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     @classmethod
     def check(cls, parameters: PpoParameters, limits: Limits) -> None:
@@ -79,7 +77,6 @@ class Ppo(Controller[PpoParameters]):
         """Take over as if the tail had just reversed."""
         self._limit.activate(observation.instruction_angle)
         self._history.forget()
-        self._latest = observation
 
     def retune(self, parameters: PpoParameters) -> None:
         """Refuse: another policy must be loaded and warmed up outside the loop."""
@@ -89,11 +86,6 @@ class Ppo(Controller[PpoParameters]):
                 "policy"
             )
 
-    def warm_up(self) -> None:
-        """Run the network on the latest observation a few times, which loads it into the caches."""
-        for _ in range(_WARM_UPS):
-            self._choose(self._latest)
-
     def update(self, observation: Observation) -> float:
         """Return Φ times the network's output, clipped to ±1 [rad].
 
@@ -102,15 +94,14 @@ class Ppo(Controller[PpoParameters]):
         returned unchanged, which causes the fault `controller-error`.
         Raise `ControllerFault` with the code `chatter`; see `DwellLimit`.
         """
-        self._latest = observation
         self.action = action = self._choose(observation)
         if abs(action) < ROUNDING and not self._network.row[self._odd].any():
             action = 1.0
         elif math.isfinite(action):
             action = max(-1.0, min(1.0, action))
-        angle = self._limit.apply(self._amplitude * action, observation.dt)
+        instruction_angle = self._limit.apply(self._amplitude * action, observation.dt)
         self.held = self._limit.share
-        return angle
+        return instruction_angle
 
     def _choose(self, observation: Observation) -> float:
         """Return the output of the network."""

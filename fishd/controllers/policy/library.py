@@ -65,7 +65,7 @@ def open_policy(text: str, limits: "Limits") -> "PolicyFile":
     path = find(text)
     policy = file.read(path)
     try:
-        policy.card.check_fit(limits.tick, limits.amplitude)
+        policy.card.check_fit(limits.tick, limits.amplitude, limits.readings)
         if limits.scaled and any(
             feature.name == "fin_velocity" for feature in policy.card.observation
         ):
@@ -90,15 +90,15 @@ def describe_training_folder(path: Path) -> str:
     )
 
 
-def describe_all(tick: float | None = None, amplitude: float | None = None) -> list[PolicyInfo]:
+def describe_all(limits: "Limits | None" = None) -> list[PolicyInfo]:
     """Describe each named policy; see `describe`."""
-    return [describe(name, tick, amplitude) for name in names()]
+    return [describe(name, limits) for name in names()]
 
 
-def describe(name: str, tick: float | None = None, amplitude: float | None = None) -> PolicyInfo:
+def describe(name: str, limits: "Limits | None" = None) -> PolicyInfo:
     """Describe a policy, by name or path.
 
-    tick, amplitude: period [s] and Φ [rad] of the robot; a policy that does not fit has a problem
+    limits: those of the robot; a policy that does not fit has a problem
     Raise `PolicyError` for an unknown name.
     """
     import msgspec
@@ -108,8 +108,8 @@ def describe(name: str, tick: float | None = None, amplitude: float | None = Non
     path, card, problem = find(name), None, ""
     try:
         card = file.read(path).card
-        if tick is not None and amplitude is not None:
-            card.check_fit(tick, amplitude)
+        if limits:
+            card.check_fit(limits.tick, limits.amplitude, limits.readings)
     except PolicyError as error:
         problem = str(error).removeprefix(f"{path}: ")
     return PolicyInfo(

@@ -198,7 +198,7 @@ class Remote(Controller[RemoteParameters]):
 
     @property
     def _is_decided(self) -> bool:
-        """Whether the command of this tick is known."""
+        """Whether the instruction angle of this tick is known."""
         return self._resting or self.action is not None
 
     def _begin(self, o: Observation) -> None:
@@ -268,7 +268,7 @@ class Remote(Controller[RemoteParameters]):
             self._late += 1
 
     def _decide(self, observation: Observation) -> float:
-        """Return the command of this tick; raise `ControllerFault` after too many misses."""
+        """Return the angle of this tick [rad]; raise `ControllerFault` after too many misses."""
         if self.action is not None:
             self._answered = self._open
             self.silent = self._late = self._foreign = 0

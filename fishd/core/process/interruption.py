@@ -1,8 +1,6 @@
 """Handling of Ctrl-C, SIGTERM and SIGHUP in programs that move a fish or compute for long."""
 
-import select
 import signal
-import socket
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -44,22 +42,6 @@ def raise_on_first_signal() -> Iterator[None]:
 
     with handle_signals(SIGNALS, heard):
         yield
-
-
-@contextmanager
-def caught_signals() -> Iterator[Callable[[float], bool]]:
-    """Yield a function that waits for one of the three signals, up to some seconds.
-
-    It returns True once one has come. Main thread only.
-    """
-    reader, writer = socket.socketpair()
-    with reader, writer, handle_signals(SIGNALS, lambda *_: None):
-        writer.setblocking(False)  # required by `signal.set_wakeup_fd`
-        before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-        try:
-            yield lambda seconds: bool(select.select([reader], [], [], seconds)[0])
-        finally:
-            signal.set_wakeup_fd(before)
 
 
 @contextmanager

@@ -35,9 +35,6 @@ class KnownKeys:
         while self._stamp is None:
             self._update()
             time.sleep(SETTLE_TIME_S / 10)
-        self.mistake: str = self._change
-        """Mistake in the file at the start; empty without one."""
-        self._change = ""
 
     def find(self, key: str) -> keys.KnownKey | None:
         """Return the client of a public key; None if the key is not known."""
@@ -65,9 +62,10 @@ class KnownKeys:
         self._clients, self._stamp = clients, stamp
 
     def find_change(self) -> str:
-        """Return why the connections must end: a key was removed, or the file is wrong; or ""."""
+        """Return why connections must end, once: a key was removed, or the file is wrong; or ""."""
         self._update()
-        return self._change
+        change, self._change = self._change, ""
+        return change
 
     def check(self, key: str, operation: str) -> None:
         """Raise `Refused` if the client may not carry out an operation, or is no longer known."""
@@ -91,29 +89,32 @@ class KnownKeys:
         return status.st_ctime_ns, status.st_size, status.st_ino, problem
 
 
-def require_keys(server: "zmq.Socket[bytes]", secret: str, folder: str) -> KnownKeys:
-    """Let only clients with a key in this folder connect to a socket; call it before `bind`.
+def require_keys(server: "zmq.Socket[bytes]", secret: str) -> None:
+    """Let only clients with a known key connect to a socket; call it before `bind`."""
+    server.set(zmq.CURVE_SERVER, 1)
+    server.set(zmq.CURVE_SECRETKEY, secret.encode())
+    server.set(zmq.ZAP_DOMAIN, b"%d" % server.socket_type)
+
+
+def judge_handshakes(context: "zmq.Context[zmq.Socket[bytes]]", known: KnownKeys) -> None:
+    """Let a thread decide which clients may connect to the sockets of a context.
 
     A client that sends requests hears that its key is not known. A subscriber hears nothing, and
     its ZeroMQ tries again; after a refusal that it hears, it would not.
     """
-    known = KnownKeys(Path(folder))
-    handshakes = server.context.socket(zmq.REP)
+    handshakes = context.socket(zmq.REP)
     handshakes.bind("inproc://zeromq.zap.01")
-    arguments = handshakes, known, b"300" if server.socket_type == zmq.PUB else b"400"
+    arguments = handshakes, known
     threading.Thread(target=_judge_handshakes, args=arguments, name="keys", daemon=True).start()
-    server.set(zmq.CURVE_SERVER, 1)
-    server.set(zmq.CURVE_SECRETKEY, secret.encode())
-    server.set(zmq.ZAP_DOMAIN, b"fishd")
-    return known
 
 
-def _judge_handshakes(handshakes: "zmq.Socket[bytes]", known: KnownKeys, refusal: bytes) -> None:
+def _judge_handshakes(handshakes: "zmq.Socket[bytes]", known: KnownKeys) -> None:
     """Answer requests of ZeroMQ's authentication protocol (ZAP) until the context ends."""
     with suppress(zmq.ContextTerminated):
         while True:
-            version, number, *_, raw_key = handshakes.recv_multipart()
+            version, number, domain, *_, raw_key = handshakes.recv_multipart()
             key = z85.encode(raw_key)
+            refusal = b"400" if domain == b"%d" % zmq.ROUTER else b"300"
             status = b"200" if known.find(key.decode()) else refusal
             # A message of this client has its key as its User-Id.
             handshakes.send_multipart([version, number, status, b"", key, b""])

@@ -1,4 +1,4 @@
-"""Limits of a gateway's process. When it exceeds one, it ends, and a new process starts."""
+"""Limits of a gateway. When it exceeds one, it starts again."""
 
 import ctypes
 import os
@@ -9,7 +9,7 @@ from typing import IO, Literal
 
 _PAGE_BYTES = resource.getpagesize()
 _NICE = 5
-"""Nice value of a gateway; for a fishd with a negative nice value, the difference to it."""
+"""Difference of the nice value of a gateway to that of fishd."""
 _CHECK_PERIOD_S = 0.1
 """Time between two checks of the limits [s]."""
 _MAX_FILES = 4096
@@ -34,7 +34,8 @@ class ResourceLimits:
         memory: memory permitted in addition to the present use [bytes]
         connections: file descriptors permitted in addition to those that are open
         """
-        _lower_priority()
+        fishd = os.getpriority(os.PRIO_PROCESS, os.getppid())
+        os.setpriority(os.PRIO_PROCESS, 0, fishd + _NICE)
         with suppress(OSError), _open_proc_file("oom_score_adj", "wb") as file:
             file.write(b"500")  # the kernel shall kill a gateway rather than fishd
         highest = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
@@ -71,19 +72,6 @@ class ResourceLimits:
         if used > self._memory:
             return f"it used {used / 2**20:.0f} MB, more than {self._memory / 2**20:.0f} MB"
         return ""
-
-
-def _lower_priority() -> None:
-    """Lower the priority of this process below that of fishd, which it inherited."""
-    os.setpriority(os.PRIO_PROCESS, 0, _nice_value(os.getpriority(os.PRIO_PROCESS, 0)))
-
-
-def _nice_value(fishd: int) -> int:
-    """Return the nice value of a gateway for that of fishd.
-
-    If fishd has priority over other programs, its gateways have it too.
-    """
-    return max(fishd, min(_NICE, fishd + _NICE))
 
 
 def _files() -> int:

@@ -1,32 +1,26 @@
-"""Messages between fishd and its gateways, over a SOCK_SEQPACKET socket."""
+"""Messages between fishd and a gateway, over a SOCK_SEQPACKET socket."""
 
 import socket
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    import zmq
 
 MAX_MESSAGE_BYTES = 65536
 """Largest size of a message on a link [bytes]; longer replies are sent in parts."""
+MAX_TELEMETRY_BYTES = 2**20
+"""Largest size of a message for subscribers [bytes]."""
 
 TELEMETRY, CONTROL = "telemetry", "control"
-KEYED_TELEMETRY, KEYED_CONTROL = "keyed-telemetry", "keyed-control"
-"""Kinds of gateways; only clients with a known key connect to the latter two."""
+"""Kinds of sockets."""
 
-REQUEST, READY, NOTICE, END = b"?", b"^", b"!", b"."
-"""First bytes of a client's request, of the start and the end of a gateway, and of fishd's end; a
-start may name a mistake in the file of known keys."""
+REQUEST, READY, TICKS = b"?", b"^", b"%"
+"""First bytes of messages from a gateway: a client's request; that it serves; whether ticks have
+subscribers."""
+EXCEEDED, CLOSED = b"!", b"x"
+"""First bytes of a limit for which the gateway starts again, and of a change of the keys for which
+it has closed the socket of telemetry."""
 PING, PONG = b"~", b"-"
-"""First bytes of a heartbeat and of the answer to it."""
+"""A heartbeat, and the answer to it."""
 LISTEN = b"@"
-"""First byte of a further address to listen at; its listener is sent with it."""
-MAX_FORMER_LISTENERS = 16
-"""Largest number of further listeners of a gateway."""
-_former_listeners: list[str] = []
-"""Addresses of the further listeners of this process."""
-START, STARTED = b"*", b"/"
-"""First bytes of a request to the fork server for a gateway, and of the answer to it."""
+"""First byte of an address to listen at, which comes with its listener."""
 _PART, _LAST = b"+", b"="
 
 _HEAD_BYTES = 9
@@ -40,49 +34,18 @@ def pair() -> tuple[socket.socket, socket.socket]:
     return ends
 
 
-def start(kind: str, address: str) -> bytes:
-    """Return a request for a gateway; its link and its listener are sent with it."""
-    return START + f"{kind} {address}".encode()
+def listen(kind: str, address: str, keys: str) -> bytes:
+    """Return the message that lets a gateway listen; the listener is sent with it.
 
-
-def kind_and_address(message: bytes) -> tuple[str, str]:
-    """Return the kind and the address in a request for a gateway."""
-    kind, _, address = message[1:].decode().partition(" ")
-    return kind, address
-
-
-def listen(server: "zmq.Socket[bytes]", message: bytes, listener: int) -> None:
-    """Let a gateway's socket listen at the address in a message, too; `listener` is its socket.
-
-    Connections end with the listener through which they came, so former ones are kept, but no more
-    than `MAX_FORMER_LISTENERS`: then all connections end, and clients connect again.
+    keys: secret key and folder of the keys; empty for a socket without keys
     """
-    import zmq
-
-    if len(_former_listeners) >= MAX_FORMER_LISTENERS:
-        for address in set(_former_listeners):  # `unbind` closes all listeners of an address
-            server.unbind(address)
-        _former_listeners.clear()
-    server.set(zmq.USE_FD, listener)
-    server.bind(message[1:].decode())
-    bound = server.get(zmq.LAST_ENDPOINT)
-    assert isinstance(bound, bytes)
-    _former_listeners.append(bound.rstrip(b"\0").decode())
+    return LISTEN + f"{kind} {address} {keys}".encode()
 
 
-def started(kind: str, pid: int, outcome: str) -> bytes:
-    """Return the answer to a request for a gateway.
-
-    pid: number of its process; 0 if it could not be started
-    outcome: text on how the previous gateway ended, or why this one could not be started
-    """
-    return STARTED + f"{kind} {pid} {outcome}".encode()
-
-
-def read_started(message: bytes) -> tuple[str, int, str]:
-    """Return kind, number of the process and outcome in the answer to a request for a gateway."""
-    kind, pid, outcome = message[1:].decode().split(" ", 2)
-    return kind, int(pid), outcome
+def read_listen(message: bytes) -> tuple[str, str, str]:
+    """Return kind, address and keys in a message of `listen`."""
+    kind, address, keys = message[1:].decode().split(" ", 2)
+    return kind, address, keys
 
 
 def join_frames(topic: bytes, payload: bytes) -> bytes:
@@ -115,6 +78,11 @@ def reply(number: int, payload: bytes) -> Iterator[bytes]:
     for start in range(0, max(1, len(payload)), size):
         is_last = start + size >= len(payload)
         yield (_LAST if is_last else _PART) + head + payload[start : start + size]
+
+
+def is_reply(message: bytes) -> bool:
+    """Return whether a message carries a reply, or a part of one."""
+    return message[:1] in (_PART, _LAST)
 
 
 class Replies:

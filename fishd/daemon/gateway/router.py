@@ -1,38 +1,19 @@
-"""Gateway of the control channel: a ROUTER socket that limits the requests to fishd."""
+"""Requests from a ROUTER socket to fishd, in a limited number, and the replies to them."""
 
 import socket
 import time
 from collections import deque
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import zmq
 
 from fishd.core import protocol
 from fishd.core.errors import Refused
-from fishd.daemon.gateway.limits import ResourceLimits
-from fishd.daemon.gateway.link import (
-    END,
-    LISTEN,
-    MAX_MESSAGE_BYTES,
-    PING,
-    PONG,
-    Replies,
-    listen,
-    request,
-)
+from fishd.daemon.gateway.link import Replies, request
 
 if TYPE_CHECKING:
     from fishd.daemon.gateway.keys import KnownKeys
 
-SOCKET = zmq.ROUTER
-MAX_MEMORY_BYTES = 48 * 2**20
-"""Largest memory in addition to that at the start [bytes]."""
-MAX_CONNECTIONS = 1500
-"""Largest number of connections, of clients and of other programs."""
-
-MAX_QUEUED_REQUESTS, MAX_QUEUED_REPLIES = 8, 64
-"""Requests and replies that ZeroMQ queues for one client; further replies are dropped."""
 MAX_OPEN_REQUESTS = 16
 """Largest number of requests that fishd has not answered yet; further requests wait here."""
 MAX_WAITING_REQUESTS = 600
@@ -41,37 +22,8 @@ URGENT_OPERATIONS = {"estop", "stop"}
 """Operations that do not wait for others."""
 MAX_EXTRA_URGENT = 2
 """Number of urgent requests that may be open in addition to MAX_OPEN_REQUESTS."""
-MAX_REFUSAL_RATE, MAX_REFUSAL_BURST = 20.0, 50.0
-"""Refusals to one client: largest rate [1/s] and burst; further requests get no reply."""
-HANDSHAKE_TIMEOUT_MS = 2000
-"""Longest time for the handshake of a connection [ms]."""
-_CHECK_PERIOD_MS = 100
-"""Longest time between two checks of the limits [ms]."""
 _REQUESTS_PER_TURN = 20
 """Number of requests that are read before replies are read."""
-_CLIENT_TIMEOUT_S = 10.0
-"""Time after which a silent client is forgotten [s]."""
-
-
-class _Client:
-    """Waiting requests of a client, and the number of refusals that it may still get."""
-
-    def __init__(self, now: float) -> None:
-        self.waiting: deque[bytes] = deque()
-        self.seen = now
-        """Time of its latest request [s, monotonic]."""
-        self._refusals = MAX_REFUSAL_BURST
-        self._refused = now
-
-    def may_refuse(self, now: float) -> bool:
-        """Return whether to answer with a refusal; not if the client ignores earlier ones."""
-        gained = (now - self._refused) * MAX_REFUSAL_RATE
-        self._refusals = min(MAX_REFUSAL_BURST, self._refusals + gained)
-        self._refused = now
-        if self._refusals < 1.0:
-            return False
-        self._refusals -= 1.0
-        return True
 
 
 class Router:
@@ -81,68 +33,32 @@ class Router:
         self,
         link: socket.socket,
         server: "zmq.Socket[bytes]",
-        limits: ResourceLimits,
         known: "KnownKeys | None",
     ) -> None:
         self._link = link
         self._server = server
-        self._limits = limits
         self._known = known
-        self._clients: dict[bytes, _Client] = {}
         self._urgent: deque[bytes] = deque()
-        self._turns: deque[_Client] = deque()
-        """Clients with waiting requests, the next one first."""
+        self._waiting: dict[bytes, deque[bytes]] = {}
+        """Other waiting requests by their client; the client whose turn is next comes first."""
         self._envelopes: dict[int, list[bytes]] = {}
         """Envelopes for the replies, by the number of the request."""
         self._open = 0
         self._replies = Replies()
         self._number = 0
         """Time when the latest request arrived [ns, monotonic], made unique."""
-        self._next_purge = 0.0
-        self._ended = False
 
-    def run(self) -> str:
-        """Pass on requests and replies until fishd ends; return the exceeded limit, if any."""
-        poller = zmq.Poller()
-        poller.register(self._link, zmq.POLLIN)
-        poller.register(self._server, zmq.POLLIN)
-        while not (self._ended or (why := self._limits.exceeded())):
-            ready = dict(poller.poll(_CHECK_PERIOD_MS))
-            if self._link.fileno() in ready:
-                self._take_replies()
-            if self._server in ready:
-                self._take_requests()
-            self._pass_on()
-            self._forget_silent_clients()
-        return "" if self._ended else why
+    def take_reply(self, message: bytes) -> None:
+        """Pass a reply of fishd, or a part of one, on to its client."""
+        if reply := self._replies.take(message):
+            number, payload = reply
+            envelope = self._envelopes.pop(number, None)
+            if envelope:  # otherwise the request came through an earlier gateway
+                self._open -= 1
+                self._answer(envelope, payload)
 
-    def _take_replies(self) -> None:
-        while not self._ended:
-            try:
-                message, listeners, _, _ = socket.recv_fds(self._link, 2 * MAX_MESSAGE_BYTES, 1)
-            except BlockingIOError:
-                return
-            except ConnectionResetError:  # fishd was killed
-                message = b""
-            if message in (b"", END):
-                self._ended = True
-                return
-            if message == PING:
-                with suppress(OSError):  # the next `recv` notices that fishd was killed
-                    self._link.send(PONG)
-                continue
-            if message.startswith(LISTEN):
-                listen(self._server, message, *listeners)
-                continue
-            reply = self._replies.take(message)
-            if reply:
-                number, payload = reply
-                envelope = self._envelopes.pop(number, None)
-                if envelope:  # otherwise the request came through an earlier gateway
-                    self._open -= 1
-                    self._answer(envelope, payload)
-
-    def _take_requests(self) -> None:
+    def take_requests(self) -> None:
+        """Read some of the waiting requests; refuse those that are wrong or too many."""
         for _ in range(_REQUESTS_PER_TURN):
             try:
                 if self._known:
@@ -158,81 +74,46 @@ class Router:
                 self._take(envelope, payload, key)
 
     def _take(self, envelope: list[bytes], payload: bytes, key: str) -> None:
-        now = time.monotonic()
-        client = self._clients.get(envelope[0])
-        if client is None:
-            client = self._clients[envelope[0]] = _Client(now)
-        client.seen = now
+        """Queue a request, or refuse it."""
+        queue = self._waiting.get(envelope[0], deque())
         try:
             operation = protocol.decode_request(payload).op
             if self._known:
                 self._known.check(key, operation)
             # A flood of urgent requests must not displace the others.
-            urgent = operation in URGENT_OPERATIONS and len(self._urgent) < MAX_OPEN_REQUESTS
-            waiting = len(client.waiting)
-            if waiting >= max(1, MAX_WAITING_REQUESTS // max(1, len(self._turns))) and not urgent:
-                raise Refused("busy", f"{waiting} of your requests are already waiting; slow down")
+            if operation in URGENT_OPERATIONS and len(self._urgent) < MAX_OPEN_REQUESTS:
+                queue = self._urgent
+            elif len(queue) >= max(1, MAX_WAITING_REQUESTS // max(1, len(self._waiting))):
+                why = f"{len(queue)} of your requests are already waiting; slow down"
+                raise Refused("busy", why)
         except Refused as error:
-            if client.may_refuse(now):
-                self._answer(envelope, protocol.failure(protocol.request_id(payload), error))
+            self._answer(envelope, protocol.failure(protocol.request_id(payload), error))
             return
         self._number = max(self._number + 1, time.monotonic_ns())
         self._envelopes[self._number] = envelope
-        message = request(self._number, payload)
-        if urgent:
-            self._urgent.append(message)
-            return
-        if not client.waiting:
-            self._turns.append(client)
-        client.waiting.append(message)
+        queue.append(request(self._number, payload))
+        if queue is not self._urgent:
+            self._waiting[envelope[0]] = queue
 
-    def _pass_on(self) -> None:
-        while self._urgent or self._turns:
+    def pass_on(self) -> None:
+        """Send waiting requests to fishd, as many as may be open at a time; clients take turns."""
+        while self._urgent or self._waiting:
             if self._open >= MAX_OPEN_REQUESTS + MAX_EXTRA_URGENT * bool(self._urgent):
                 return
-            waiting = self._urgent or self._turns[0].waiting
+            client, queue = b"", self._urgent
+            if not queue:
+                client, queue = next(iter(self._waiting.items()))
             try:
-                self._link.send(waiting[0])
+                self._link.send(queue[0])
             except BlockingIOError:
                 return
-            except OSError:
-                self._ended = True
-                return
             self._open += 1
-            waiting.popleft()
-            if waiting is not self._urgent:
-                client = self._turns.popleft()
-                if client.waiting:
-                    self._turns.append(client)
+            queue.popleft()
+            if queue is not self._urgent:
+                del self._waiting[client]
+                if queue:
+                    self._waiting[client] = queue  # after all others
 
     def _answer(self, envelope: list[bytes], payload: bytes) -> None:
         # Never blocks: ROUTER drops the messages that a client does not read.
         self._server.send_multipart([*envelope, payload], zmq.DONTWAIT)
-
-    def _forget_silent_clients(self) -> None:
-        now = time.monotonic()
-        if now >= self._next_purge:
-            self._next_purge = now + _CLIENT_TIMEOUT_S
-            self._clients = {
-                name: client
-                for name, client in self._clients.items()
-                if client.waiting or now - client.seen < _CLIENT_TIMEOUT_S
-            }
-
-
-def configure(server: "zmq.Socket[bytes]") -> None:
-    """Set the limits for each client."""
-    server.set(zmq.RCVHWM, MAX_QUEUED_REQUESTS)
-    server.set(zmq.SNDHWM, MAX_QUEUED_REPLIES)
-    server.set(zmq.MAXMSGSIZE, protocol.MAX_MESSAGE)
-    server.set(zmq.HANDSHAKE_IVL, HANDSHAKE_TIMEOUT_MS)
-
-
-def run(
-    link: socket.socket,
-    server: "zmq.Socket[bytes]",
-    limits: ResourceLimits,
-    known: "KnownKeys | None",
-) -> str:
-    """Pass on requests and replies until fishd ends; return the exceeded limit, if any."""
-    return Router(link, server, limits, known).run()

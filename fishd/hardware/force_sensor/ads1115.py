@@ -29,8 +29,9 @@ ADC_STEPS = 32768
 """Number of steps of the ADC from zero to full scale."""
 MAX_SAMPLE_PERIODS = 1.25
 """Longest time of a conversion with its transfers, as a multiple of 1 / data rate."""
-MIN_PAIRS_PER_CONVERSION = 8 / 0.05 / 860
-"""Lowest number of pairs per nominal conversion on a bus of 400 kbit/s."""
+MIN_PAIRS_PER_CONVERSION = 160 / 860
+"""Lowest number of pairs per nominal conversion on a bus of 400 kbit/s: 160 pairs a second at 860
+samples a second."""
 SUPPLY_V = 3.3
 """Supply of the ADC and of the amplifiers in docs/how-to/wiring.md [V]."""
 
@@ -176,12 +177,7 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
     @classmethod
     def check(cls, settings: Ads1115Settings, tick: float) -> None:
         """Refuse an impossible range, one input for both forces, or too slow a rate."""
-        if settings.full_scale not in FULL_SCALES_V:
-            permitted = ", ".join(f"{scale:g}" for scale in FULL_SCALES_V)
-            raise Problem(
-                ("full_scale",),
-                f"{settings.full_scale:g} is not valid: one of {permitted} V is needed",
-            )
+        check_full_scale(settings.full_scale)
         low, high = settings.saturation_low, settings.saturation_high
         if low is not None and high is not None and low >= high:
             raise Problem(
@@ -222,6 +218,15 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
         key = "saturation_high" if code >= self._highest else "saturation_low"
         volts = code * self._step
         return f"{name} is at {volts:+.4g} V: the amplifier is at its end (force_sensor.{key})"
+
+
+def check_full_scale(full_scale: float) -> None:
+    """Raise `Problem` unless this is a range of the chip, ± [V]."""
+    if full_scale not in FULL_SCALES_V:
+        permitted = ", ".join(f"{scale:g}" for scale in FULL_SCALES_V)
+        raise Problem(
+            ("full_scale",), f"{full_scale:g} is not valid: one of {permitted} V is needed"
+        )
 
 
 def _amplifier(settings: Ads1115Settings) -> Result:

@@ -49,7 +49,7 @@ class SampledSensor(SampledPart[Pair]):
         between_samples: function called before each sample in virtual time, for other users of the
             clock
         """
-        super().__init__(driver, clock)
+        super().__init__(driver, clock, driver.transport)
         self.calibration = calibration
         """Calibration that turns voltages into forces."""
         self._tick = tick

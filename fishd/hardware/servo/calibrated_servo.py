@@ -57,12 +57,12 @@ class CalibratedServo:
         self._settings = settings
         self.calibration = calibration
 
-    def write(self, angle: float) -> None:
+    def write(self, instruction_angle: float) -> None:
         """Send an instruction angle [rad]; start the pulses if there are none.
 
         Raises `ServoError` when the servo cannot be reached, and for an angle beyond its limits.
         """
-        call_foreign(self.driver.write, pulses.pulse_width(self._settings, angle))
+        call_foreign(self.driver.write, pulses.pulse_width(self._settings, instruction_angle))
 
     def release(self) -> None:
         """Stop the pulses; may be called twice. Raises `ServoError`."""

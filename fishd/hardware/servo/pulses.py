@@ -15,22 +15,26 @@ NEUTRAL_TIME_S = 0.3
 """Time at neutral before the pulses end, for a servo that did not get there slowly [s]."""
 
 
-def pulse_width(servo: "ServoSettings", angle: float) -> float:
+def pulse_width(servo: "ServoSettings", instruction_angle: float) -> float:
     """Return the pulse [µs] for an instruction angle [rad].
 
     Raises `ServoError` for an angle that is not finite or beyond the soft limits, and for a pulse
     that no servo accepts. The guard limits commands before they get here.
     """
     # NaN is refused too.
-    if not servo.lowest - ANGLE_TOLERANCE_RAD <= angle <= servo.highest + ANGLE_TOLERANCE_RAD:
+    if (
+        not servo.lowest - ANGLE_TOLERANCE_RAD
+        <= instruction_angle
+        <= servo.highest + ANGLE_TOLERANCE_RAD
+    ):
         raise ServoError(
-            f"the angle {angle:g} rad is not within the servo's soft limits, "
+            f"the angle {instruction_angle:g} rad is not within the servo's soft limits, "
             f"{servo.lowest:g} to {servo.highest:g} rad"
         )
-    width = servo.centre + servo.trim + servo.direction * servo.scale * angle
+    width = servo.centre + servo.trim + servo.direction * servo.scale * instruction_angle
     if not MIN_PULSE_US <= width <= MAX_PULSE_US:
         raise ServoError(
-            f"the angle {angle:g} rad needs a pulse of {width:.0f} µs, beyond "
+            f"the angle {instruction_angle:g} rad needs a pulse of {width:.0f} µs, beyond "
             f"{MIN_PULSE_US:.0f} to {MAX_PULSE_US:.0f} µs"
         )
     return width

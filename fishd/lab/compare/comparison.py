@@ -6,7 +6,7 @@ from itertools import count
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from msgspec import Struct
+from msgspec import field
 from msgspec.structs import replace
 
 from fishd.camera.simulated import SimulatedCameraSettings
@@ -20,6 +20,7 @@ from fishd.lab.compare.contestants import (
     parse,
     refusal,
 )
+from fishd.lab.error_budget import Thrust
 from fishd.lab.ranking import (
     Candidate,
     complexity,
@@ -48,16 +49,15 @@ class Trace(NamedTuple):
     fin: list[float]  # true α at `time`, rad; NaN where unknown
 
 
-class Standing(Struct, frozen=True, kw_only=True):
-    """Result of a contestant, as means over its runs."""
+class Standing(Thrust, frozen=True, kw_only=True):
+    """Result of a contestant, as means over its runs.
+
+    In simulation the thrust is exact: a single run has no interval, and no calibration counts.
+    """
 
     contestant: str
     controller: str
     parameters: dict[str, Any]
-    thrust: float
-    """Mean thrust [N]."""
-    thrust_ci95: float | None
-    """Half-width of the 95 % interval of `thrust` [N]; None for a single run in simulation."""
     frequency: float
     """Frequency of the tail beat [Hz]."""
     fullness: float
@@ -68,27 +68,12 @@ class Standing(Struct, frozen=True, kw_only=True):
     """Thrust of each run [N]."""
     relative_thrust: float | None = None
     """Thrust over that of the best square wave; None for a real fish."""
-    faults: list[str] = []
+    faults: list[str] = field(default_factory=list)
     """Reasons of runs that ended in mode fault."""
-    fallbacks: list[str] = []
+    fallbacks: list[str] = field(default_factory=list)
     """Reasons why the fallback took over in runs; the results include its swimming."""
-    runs: list[Report] = []
+    runs: list[Report] = field(default_factory=list)
     """Reports of the runs of a simulated fish; empty for a real fish."""
-    power: float | None = None
-    """Electrical power of the servo [W]; None where unknown."""
-    thrust_per_watt: float | None = None
-    """Thrust over electrical power [N/W]."""
-    thrust_per_watt_ci95: float | None = None
-    """Half-width of the 95 % interval of `thrust_per_watt` [N/W]; None for one simulated run."""
-    calibration_ci95: float | None = None
-    """Half-width of the 95 % interval of the thrust that the calibration alone causes [N].
-
-    None in simulation, where the thrust is exact, and where it is unknown.
-    """
-    total_ci95: float | None = None
-    """Half-width of the 95 % interval from `thrust_ci95` and `calibration_ci95` together [N]."""
-    thrust_per_watt_total_ci95: float | None = None
-    """Half-width of the 95 % interval of `thrust_per_watt`, calibration included [N/W]."""
 
 
 def compare(

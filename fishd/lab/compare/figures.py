@@ -160,9 +160,9 @@ def _draw_bar(
 
 
 def _describe(axis: Any, standing: Standing, unit: str) -> None:
-    half_width = standing.thrust_ci95 if standing.total_ci95 is None else standing.total_ci95
+    thrust = text.format_measured(standing.thrust, standing.known_ci95, unit)
     caption = (
-        f"{text.format_measured(standing.thrust, half_width, unit)}, {standing.frequency:.2f} Hz\n"
+        f"{thrust}, {standing.frequency:.2f} Hz\n"
         f"$|φ_c|/Φ$ {standing.fullness:.2f}, form factor {standing.form_factor:.2f}"
     )
     style = {"va": "top", "fontsize": 6, "color": "0.35", "transform": _across(axis)}

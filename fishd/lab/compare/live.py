@@ -2,19 +2,19 @@
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
 
-from fishd.core.calibration import ForceCalibration
 from fishd.core.errors import FishdError
 from fishd.core.signals import Tick
 from fishd.lab.compare.comparison import Standing, Trace, trace
 from fishd.lab.compare.contestants import Contestant, parse
-from fishd.lab.error_budget import budget
+from fishd.lab.error_budget import thrust_fields
 from fishd.lab.measurement import ThrustMeasurement, measure
 from fishd.lab.session import Session, concerns_one_controller
-from fishd.lab.statistics import per_watt, weighted_mean
+from fishd.lab.statistics import weighted_mean
 from fishd.lab.swim_plan import plan
 
 
@@ -69,6 +69,11 @@ class LiveComparison:
             _standing(contestant.label, runs, self._session) for contestant, runs in pairs if runs
         ]
 
+    def remarks(self) -> list[tuple[str, str]]:
+        """Return the remarks on measurements, each after the label of its contestant."""
+        pairs = zip(self.contestants, self._measured, strict=True)
+        return [(c.label, run.remark) for c, runs in pairs for run in runs if run.remark]
+
     def traces(self) -> list[Trace]:
         """Return the ends of their last swims, with the drift subtracted."""
         return [_trace(runs[-1]) for runs in self._measured if runs]
@@ -85,68 +90,34 @@ def _standing(label: str, runs: list[ThrustMeasurement], session: Session) -> St
     angles = [abs(tick.phi_c) for run in runs for tick in run.ticks if tick.mode == "running"]
     mean = sum(angles) / len(angles)
     rms = math.sqrt(sum(angle**2 for angle in angles) / len(angles))
-    standing = Standing(
+    rotation, lateral = np.average(
+        [(run.rotation, run.lateral) for run in runs], axis=0, weights=weights
+    ).tolist()
+    return Standing(
         contestant=label,
         controller=runs[0].controller,
         parameters=dict(runs[0].parameters),
-        thrust=thrust,
-        thrust_ci95=error,
         thrusts=thrusts,
         frequency=float(np.average([run.frequency for run in runs], weights=weights)),
         fullness=mean / session.amplitude,
         form_factor=mean / rms if rms else 0.0,
+        **thrust_fields(
+            session.calibration, thrust, error, rotation=rotation, lateral=lateral, **_power(runs)
+        ),
     )
-    standing = replace(standing, **_power(runs))
-    return replace(standing, **_budget(runs, weights, standing, session.calibration))
 
 
-def _power(runs: list[ThrustMeasurement]) -> dict[str, float]:
-    """Return power and thrust per watt as fields of a standing; empty if unknown for any run."""
-    results = [
-        (run.watts, *per_watt(run.thrust, run.thrust_ci95, run.watts, run.watts_ci95))
-        for run in runs
-    ]
+def _power(runs: list[ThrustMeasurement]) -> dict[str, Any]:
+    """Return power and thrust per watt, for `thrust_fields`; empty if unknown for any run."""
     complete = [
-        (watts, thrust_per_watt, error)
-        for watts, thrust_per_watt, error in results
-        if watts and thrust_per_watt and error
+        (run.power, run.thrust_per_watt, run.thrust_per_watt_ci95)
+        for run in runs
+        if run.power and run.thrust_per_watt and run.thrust_per_watt_ci95
     ]
     if len(complete) < len(runs):
         return {}
-    mean, ci95 = weighted_mean(
-        [item for _, item, _ in complete], [error for _, _, error in complete]
-    )
-    return {
-        "power": sum(watts for watts, _, _ in complete) / len(complete),
-        "thrust_per_watt": mean,
-        "thrust_per_watt_ci95": ci95,
-    }
-
-
-def _budget(
-    runs: list[ThrustMeasurement],
-    weights: list[float],
-    standing: Standing,
-    calibration: ForceCalibration,
-) -> dict[str, float | None]:
-    """Return the error of the calibration, which is the same in all runs, as fields of a standing.
-
-    weights: weights of the runs
-    """
-    rotation, lateral = np.average(
-        [(run.rotation, run.lateral) for run in runs], axis=0, weights=weights
-    ).tolist()
-    total = budget(calibration, standing.thrust, standing.thrust_ci95, lateral, rotation)
-    fields = total._asdict()
-    if standing.power and standing.thrust_per_watt is not None:
-        fields["thrust_per_watt_total_ci95"] = budget(
-            calibration,
-            standing.thrust_per_watt,
-            standing.thrust_per_watt_ci95,
-            lateral / standing.power,
-            rotation,
-        ).total_ci95
-    return fields
+    power, per_watt, errors = zip(*complete, strict=True)
+    return {"power": sum(power) / len(power), "thrust_per_watt": weighted_mean(per_watt, errors)}
 
 
 def _trace(run: ThrustMeasurement) -> Trace:

@@ -405,8 +405,7 @@ def continue_experiment(
     """
     if not recorded:
         return [experiment(session, seconds)]
-    session.used = sum(map(len, recorded)) * session.tick
-    missing = seconds - session.used
+    missing = seconds - sum(map(len, recorded)) * session.tick
     tables = list(recorded)
     if missing >= MIN_CONTINUATION_S:
         tables.append(_swim_excitation(session, missing))

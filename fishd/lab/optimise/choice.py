@@ -1,6 +1,7 @@
 """Choice of candidates: those of a search, then the best one, whose measurement is the result."""
 
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Mapping
 from typing import Any
 
 from fishd.lab.optimise.least_power import LeastPower
@@ -25,12 +26,10 @@ class Choice:
         aim: Aim,
         fixed: Mapping[str, Any],
         min_gain: float,
-        before: Iterable[Trial] = (),
     ) -> None:
         """
         fixed: parameters that are not searched
         min_gain: expected gain of another candidate, as a fraction, below which the search ends
-        before: trials of a search that is resumed
         """
         self.search = search
         self._aim, self._fixed, self._min_gain = aim, fixed, min_gain
@@ -40,8 +39,8 @@ class Choice:
         self._beat = 0.0
         self.final: Trial | None = None
         """Latest measurement of a best candidate."""
-        for trial in before:
-            self.add(trial)
+        self.waited = 0.0
+        """Time that choices have taken, in which the fish waits [s]."""
 
     def add(self, trial: Trial) -> None:
         """Add a measured candidate."""
@@ -59,6 +58,13 @@ class Choice:
 
     def next(self, time_left: float) -> Candidate | None:
         """Return the next candidate; None at the end of the search, or of the time."""
+        begin = time.monotonic()
+        try:
+            return self._choose(time_left)
+        finally:
+            self.waited += time.monotonic() - begin
+
+    def _choose(self, time_left: float) -> Candidate | None:
         if not self.search.is_filled:
             return Candidate(self.search.suggest())
         proposal = self.search.propose()

@@ -83,7 +83,7 @@ class Trial(NamedTuple):
     is_final: float = 0.0
     """1 for a measurement of the best candidate that is longer and may be the result, else 0."""
     rotation: float = 0.0
-    """Rotation of the sensor visible in this swim; 0 for a trial read from a table [rad]."""
+    """Rotation of the sensor visible in this swim [rad]."""
 
 
 TRIAL_COLUMNS = (
@@ -93,29 +93,30 @@ TRIAL_COLUMNS = (
 """Columns of a table of trials, after the columns of the searched parameters."""
 
 
-def read_trials(experiment: Experiment, names: Iterable[str]) -> list[Trial]:
-    """Return the trials that a search has written.
+class TrialTable:
+    """Table of the trials of a search, in the folder of its experiment."""
 
-    names: names of the searched parameters
-    Raises `ConfigError` if the table is not that of such a search.
-    """
-    names = tuple(names)
-    trials = []
-    for row in experiment.read_rows((*names, *TRIAL_COLUMNS)):
+    def __init__(self, experiment: Experiment, names: Iterable[str]) -> None:
+        """Read the candidates of an interrupted search.
+
+        names: names of the searched parameters
+        Raises `ConfigError` if the table is not that of such a search, and `FishdError`.
+        """
+        names = tuple(names)
+        self._table = experiment.open_table((*names, *TRIAL_COLUMNS))
         try:
-            values = {name: float(text) for name, text in row.items()}
+            self.candidates = [
+                Candidate({name: float(row[name]) for name in names}, bool(float(row["is_final"])))
+                for row in self._table.rows
+            ]
         except ValueError as error:
             raise ConfigError(f"{experiment.path}: not a table of a search: {error}") from None
-        parameters = {name: values.pop(name) for name in names}
-        trials.append(Trial(parameters, **values)._replace(swim_ticks=int(values["swim_ticks"])))  # type: ignore[arg-type]
-    return trials
 
-
-def write_trial(experiment: Experiment, trial: Trial) -> None:
-    """Add a trial to the table of a search; raises `FishdError`."""
-    experiment.add_row(
-        {**trial.parameters, **{name: getattr(trial, name) for name in TRIAL_COLUMNS}}
-    )
+    def add(self, trial: Trial) -> None:
+        """Add a trial; raises `FishdError`."""
+        self._table.add(
+            {**trial.parameters, **{name: getattr(trial, name) for name in TRIAL_COLUMNS}}
+        )
 
 
 def measure_trials(
@@ -124,7 +125,7 @@ def measure_trials(
     fixed: Mapping[str, Any],
     choose: Callable[[float], Candidate | None],
     budget: float,
-    before: Trial | None = None,
+    before: Sequence[Candidate] = (),
 ) -> Iterator[Trial]:
     """Measure candidates on a rig until there is none, or for as long as the budget lasts.
 
@@ -134,20 +135,25 @@ def measure_trials(
     fixed: parameters that are not searched
     choose: returns the next candidate for the time left [s]; the one before was yielded
     budget: time in the tank [s]
-    before: last trial of a resumed search
+    before: candidates of an interrupted search, which come first whatever is chosen and left; its
+        session has their swims in its log, or swims them again in virtual time
     Raises `ParameterError`, `Refused` and `Disturbed`.
     """
+    kept = list(before)
     rest: list[Tick] = []
     steps: list[Step] = []
-    swim_ticks, tank_time, beat = (
-        (before.swim_ticks, before.tank_time, before.beat) if before else (0, 0.0, 0.0)
-    )
-    tank_time += MEAN_REST_S
-    while candidate := choose(budget - tank_time):
+    swim_ticks, tank_time, beat = 0, MEAN_REST_S, 0.0
+    while True:
+        candidate = choose(budget - tank_time)
+        is_kept = bool(kept)
+        if is_kept:
+            candidate = kept.pop(0)
+        if candidate is None:
+            return
         parameters = {**fixed, **candidate.parameters}
         settles, length, swims = candidate.durations(fixed, beat)
         duration = swims * (length + MEAN_REST_S)
-        if tank_time + duration > budget:
+        if tank_time + duration > budget and not is_kept:
             return
         rest = rest or session.rest(MEAN_REST_S)
         ticks, swum = [*rest], 0
@@ -164,7 +170,7 @@ def measure_trials(
         beat = 1.0 / evaluation.frequency if evaluation.frequency else 0.0
         power, power_ci95 = (
             math.nan if value is None else value
-            for value in (evaluation.watts, evaluation.watts_ci95)
+            for value in (evaluation.power, evaluation.power_ci95)
         )
         yield Trial(
             candidate.parameters,
@@ -307,7 +313,7 @@ class Aim(NamedTuple):
         if not (math.isfinite(trial.power) and trial.power > 0.0):
             raise ParameterError(
                 "this needs the power of the servo, and the fish has no power meter that can be "
-                "read: set power_meter in its configuration, see docs/how-to/bench.md"
+                "read: add one to sensors in its configuration, see docs/how-to/bench.md"
             )
         if isinstance(search, LeastPower):
             search.observe(trial.parameters, thrust, (trial.power, trial.power_ci95))

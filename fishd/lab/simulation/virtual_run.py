@@ -1,5 +1,6 @@
 """The control loop of fishd on a simulated fish in virtual time; its ticks, also as a table."""
 
+import dataclasses
 import os
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -12,9 +13,10 @@ from fishd import __version__
 from fishd.assembly import build_loop, open_fish_in_virtual_time
 from fishd.config import Config, adopt, load
 from fishd.controllers import registry
-from fishd.core.clock import VirtualClock, virtual_slots
+from fishd.core.clock import Slot, VirtualClock, virtual_slots
 from fishd.core.dataframes import ticks_to_frame
 from fishd.core.errors import ParameterError
+from fishd.core.schema import Reading
 from fishd.core.signals import Event, Publisher, Tick
 from fishd.virtual.plant.base import TrueWindow
 
@@ -61,8 +63,12 @@ class KeepingPublisher:
 class VirtualRun:
     """fishd's loop on a simulated fish in virtual time, a tick at a time; a context manager."""
 
-    def __init__(self, config: Config, publisher: Publisher | None) -> None:
-        """publisher: receiver of every tick and event; None to create no messages
+    def __init__(
+        self, config: Config, publisher: Publisher | None, *, metered: bool = True
+    ) -> None:
+        """
+        publisher: receiver of every tick and event; None to create no messages
+        metered: whether the loop reads the power of the servo; False is faster
 
         Raises `MissingPackage`.
         """
@@ -71,6 +77,9 @@ class VirtualRun:
         with ExitStack() as stack:
             robot, self.fish = open_fish_in_virtual_time(config, stack)
             """The fish itself, as `RobotKind.open` describes it."""
+            if not metered:
+                others = tuple(s for s in robot.sensors if "power" not in s.declared)
+                robot = dataclasses.replace(robot, sensors=others)
             self.loop = build_loop(config, robot, clock, publisher)
             stack.callback(self.loop.close)
             self._stack = stack.pop_all()
@@ -99,6 +108,11 @@ class VirtualRun:
             "force_unit": loop.robot.force_unit,
         }
 
+    @property
+    def readings(self) -> dict[str, Reading]:
+        """Readings of the sensors by name, for a recording."""
+        return self.loop.readings.declared
+
     def set_controller(self, name: str, parameters: Mapping[str, Any]) -> None:
         """Make a controller the active one, from the next tick on.
 
@@ -107,9 +121,13 @@ class VirtualRun:
         limits = replace(self.config.limits, virtual=True)
         self.loop.set_controller(name, registry.create(name, parameters, limits))
 
+    def next_slot(self) -> Slot:
+        """Advance the clock by a tick, for a caller of both halves of a tick of the loop."""
+        return next(self._slots)
+
     def tick(self) -> TrueWindow:
         """Run one tick; return the true motion between its read and the one before."""
-        self.loop.tick(next(self._slots))
+        self.loop.tick(self.next_slot())
         window: TrueWindow = self.fish.take_window()
         return window
 

@@ -2,7 +2,7 @@
 
 import math
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from fishd.lab.measurement import measure
 from fishd.lab.parallel import workers
 from fishd.lab.session import Session, concerns_one_controller
 from fishd.lab.simulation import Beats, VirtualRun
-from fishd.lab.statistics import per_watt, student95
+from fishd.lab.statistics import student95
 from fishd.lab.sweep.grid import Lengths, Point
 from fishd.lab.sweep.results import PointResult, Result, SweepFolder
 from fishd.lab.swimmer.speed import swim_freely
@@ -32,7 +32,6 @@ SLOWEST_BEAT_HZ = 0.4
 STOP_FILE = "stop"
 """Name of the file in the folder that ends a sweep in simulation."""
 
-PointCallback = Callable[[Point, PointResult], None]
 _STOP_CHECK_TICKS = 50
 
 
@@ -64,7 +63,7 @@ def simulate_point(task: Task) -> tuple[PointResult, bytes] | None:
             result: PointResult
 
             def describe_run(run: VirtualRun) -> None:
-                writer.describe(run.config, run.about())
+                writer.describe(run.config, run.about(), run.readings)
 
             arguments = (task.point, task.config, task.lengths, writer, describe_run)
             measure = swim if task.config.kind.is_tethered else swim_freely
@@ -152,17 +151,14 @@ def measure_point(point: Point, session: Session, seconds: float) -> Result:
         if not concerns_one_controller(error):
             raise
         return Result(failure=str(error))
-    per_watt_value, per_watt_ci95 = per_watt(
-        measured.thrust, measured.thrust_ci95, measured.watts, measured.watts_ci95
-    )
     return Result(
         thrust=measured.thrust,
         thrust_ci95=measured.thrust_ci95,
         beat_frequency=measured.frequency,
-        power=measured.watts,
-        thrust_per_watt=per_watt_value,
-        thrust_per_watt_ci95=per_watt_ci95,
-        seconds=len(measured.ticks) * session.tick,
+        power=measured.power,
+        thrust_per_watt=measured.thrust_per_watt,
+        thrust_per_watt_ci95=measured.thrust_per_watt_ci95,
+        seconds=measured.seconds,
     )
 
 
@@ -170,40 +166,32 @@ def swim_all(
     folder: SweepFolder,
     points: Sequence[tuple[Point, Config]],
     lengths: Lengths,
-    done: PointCallback,
     jobs: int | None = None,
     cluster: str | None = None,
-) -> bool:
-    """Swim simulated fish at the missing points; return False if a signal ended the sweep early.
+) -> Generator[tuple[Point, PointResult], None, None]:
+    """Swim simulated fish at the missing points; yield each with its result, which is stored.
+
+    A signal ends this early.
 
     points: the points, each with the configuration of its fish
-    done: called with each finished point
     jobs, cluster: as for `fishd.lab.parallel.workers`
     Raises `FishdError`; the results of finished points are kept.
     """
     missing = [pair for pair in points if folder.key(pair[0]) not in folder.results]
     if not missing:
-        return True
+        return
     with workers(folder.path / STOP_FILE, jobs, cluster) as pool, on_signal(pool.ask_to_stop):
         tasks = [Task(point, config, lengths, pool.stop) for point, config in missing]
         for index, outcome in pool.run(simulate_point, tasks):
-            if outcome is None:
-                continue
-            point = missing[index][0]
-            result, recording = outcome
-            folder.add_result(point, result, recording)
-            done(point, result)
-    return all(folder.key(point) in folder.results for point, _ in missing)
+            if outcome is not None:
+                folder.add_result(missing[index][0], *outcome)
+                yield missing[index][0], outcome[0]
 
 
 def measure_all(
-    folder: SweepFolder,
-    points: Sequence[Point],
-    session: Session,
-    seconds: float,
-    done: PointCallback,
-) -> None:
-    """Measure the missing points in a session that the caller has entered.
+    folder: SweepFolder, points: Sequence[Point], session: Session, seconds: float
+) -> Iterator[tuple[Point, PointResult]]:
+    """Measure the missing points in a session that the caller has entered; yield each result.
 
     If a controller is refused or gives up, its point gets `failure` and the next one is measured.
 
@@ -218,4 +206,4 @@ def measure_all(
         with session.recorded(path, point.label(), extra):
             result = measure_point(point, session, seconds)
         folder.add_result(point, result, path)
-        done(point, result)
+        yield point, result

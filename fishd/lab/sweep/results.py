@@ -132,8 +132,8 @@ class SweepFolder:
         self.results: dict[tuple[str, ...], PointResult] = {}
         self._columns = tuple(columns)
         measured = self.quantity.measured
-        rows = experiment.read_rows((*columns, *measured, RECORDING_COLUMN))
-        for row in rows:
+        self._table = experiment.open_table((*columns, *measured, RECORDING_COLUMN))
+        for row in self._table.rows:
             given = {name: row[name] for name in measured if row[name]}
             try:
                 result = msgspec.convert(given, self.quantity.result, strict=False)
@@ -158,7 +158,7 @@ class SweepFolder:
         key = self.key(point)
         values = msgspec.structs.asdict(result)
         row = dict(zip(self._columns, key, strict=True)) | values
-        self.experiment.add_row(row | {RECORDING_COLUMN: f"{RECORDINGS_FOLDER}/{recording.name}"})
+        self._table.add(row | {RECORDING_COLUMN: f"{RECORDINGS_FOLDER}/{recording.name}"})
         self.results[key] = result
 
     def recording_path(self, point: Point) -> Path:
@@ -172,8 +172,7 @@ class SweepFolder:
     def sort(self, points: Sequence[Point]) -> None:
         """Sort the rows in the order of these points; other rows stay at the end."""
         order = {self.key(point): index for index, point in enumerate(points)}
-        rows = self.experiment.read_rows(
-            (*self._columns, *self.quantity.measured, RECORDING_COLUMN)
-        )
+        names = (*self._columns, *self.quantity.measured, RECORDING_COLUMN)
+        rows = self.experiment.open_table(names).rows
         rows.sort(key=lambda row: order.get(tuple(row[n] for n in self._columns), len(order)))
-        self.experiment.write_rows(rows)
+        self._table.replace(rows)

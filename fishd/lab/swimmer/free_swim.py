@@ -136,7 +136,7 @@ def swim(
         track = Track()
         if resume:
             resume.put_into(fish)
-            run.loop.instruction_angle = fish.command  # the new controller starts from this angle
+            run.loop.instruction_angle = fish.instruction_angle  # the controller starts from it
             track = Track(resumed_rows)
         resumed_ticks = len(track)
         track.begin(fish)
@@ -151,11 +151,11 @@ def swim(
             writer.write(fish, track, midlines, settings, name, parameter_values, command)
 
         while len(track) < ticks:
-            command = run.loop.instruction_angle
+            instruction_angle = run.loop.instruction_angle
             run.tick()
             if fish.trouble:
                 break
-            track.add(fish, command)
+            track.add(fish, instruction_angle)
             if file:
                 midlines.add(fish)
             watch(fish)

@@ -85,14 +85,14 @@ def swim_freely(
         reversals = Reversals()
         first: int | None = None
         while first is None and not _is_long_enough(track, beat_starts, lengths, config.tick):
-            command = run.loop.instruction_angle
+            instruction_angle = run.loop.instruction_angle
             run.tick()
             problem = fish.trouble or run.loop.supervisor.reason or run.loop.active.fallback
             if problem:
                 message = getattr(problem, "message", str(problem))
                 return SpeedResult(seconds=len(track) * config.tick, failure=message)
-            track.add(fish, command)
-            if reversals.add(command) > 0 and len(track) * config.tick > lengths.settle:
+            track.add(fish, instruction_angle)
+            if reversals.add(instruction_angle) > 0 and len(track) * config.tick > lengths.settle:
                 beat_starts.append(len(track) - 1)
                 first = _find_first_row(track, beat_starts, lengths, config)
             if len(track) % _STOP_CHECK_TICKS == 0 and stop():

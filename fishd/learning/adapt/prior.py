@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 from fishd.lab.identification import Identification
 from fishd.lab.statistics import Z95
-from fishd.learning.adapt.state import Model
+from fishd.learning.adapt.results import Model
 
 Array = NDArray[np.float64]
 

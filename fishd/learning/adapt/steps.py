@@ -7,29 +7,29 @@ fish that agree with the fit.
 import math
 import shutil
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from fishd.config import Config, Start
-from fishd.core.errors import PolicyError
+from fishd.config import Config, ServoSettings, Start
+from fishd.core.errors import FishdError, ParameterError, PolicyError
+from fishd.lab.compare.contestants import Contestant
 from fishd.lab.identification import DEFAULT, Identification, Unidentifiable, identify
 from fishd.lab.identification.fit import BOUNDS, LOGARITHMIC
 from fishd.lab.identification.result import RIG_PARAMETERS
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import (
     Candidate,
-    Trial,
     measure_trials,
     restrict_to_whole_ticks,
     trial_durations,
 )
 from fishd.lab.session import Session
-from fishd.lab.swim_plan import MEAN_REST_S, MEAN_SWIM_S
+from fishd.lab.swim_plan import MEAN_REST_S
 from fishd.lab.swim_plan import plan as plan_of
 from fishd.learning.adapt.prior import (
     combine,
@@ -38,7 +38,16 @@ from fishd.learning.adapt.prior import (
     is_rejected,
     model_of,
 )
-from fishd.learning.adapt.state import POLICY, TRAINING, Fitted, Model, Rung, Trained, Tried
+from fishd.learning.adapt.results import (
+    POLICY,
+    SQUARE,
+    TRAINING,
+    Fitted,
+    Model,
+    Rung,
+    Trained,
+    Wave,
+)
 from fishd.learning.export import export
 from fishd.learning.settings import (
     EnvironmentSettings,
@@ -54,6 +63,9 @@ from fishd.learning.train.training import train
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.optimum import best_square_wave, square_wave
 from fishd.virtual.plant.parameters import PlantParameters
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 FITTED = (*DEFAULT, "lateral_quadratic_drag", "servo_dead_zone", "servo_reaction")
 """Fitted parameters: all that a fit can find except slack, which backlash represents."""
@@ -71,6 +83,8 @@ MAX_DRAWS = 20
 """Largest number of draws for each fish of the cloud."""
 EPISODE = 128
 """Steps per episode; each episode swims one fish of the cloud."""
+MAX_OFFSET_N = 10.0
+"""Largest half-width of the range of the offset of F_y [N]."""
 MAX_NOISE = 0.3
 """Largest noise of a tick in the training, as a share of the best thrust; more would hide the
 reward."""
@@ -84,13 +98,17 @@ EVALUATION_INTERVAL, OTHER_FISH = 5, 3
 """Updates per evaluation, and number of fish of the cloud evaluated beside the identified one."""
 
 
-def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, Fitted]:
-    """Fit a fish to a recorded excitation, without prior knowledge; return it and its cloud.
+def fit(
+    table: "DataFrame", servo: ServoSettings | None, amplitude: float, seed: int
+) -> tuple[Identification, Fitted]:
+    """Fit a fish to an excitation, without prior knowledge; return it and its cloud.
 
+    table: ticks of the excitation
+    servo: calibrated settings of the servo; None where commands need no pulses
     amplitude: Φ [rad]
     Raises `Unidentifiable`, also where the fit explains less than `MIN_EXPLAINED` of both forces.
     """
-    identification = identify([recording], fit=FITTED)
+    identification = identify([table], fit=FITTED, servo=servo)
     explained = max(channel.explained for channel in identification.channels)
     if not explained >= MIN_EXPLAINED:
         raise Unidentifiable(
@@ -107,7 +125,7 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
     fitted = Fitted(
         plant=plant,
         rig=msgspec.convert(identification.simulation, SimulationSettings),
-        offset=max(offset.ci95_high - offset.value, 0.5 * drift),
+        offset=min(MAX_OFFSET_N, max(offset.ci95_high - offset.value, 0.5 * drift)),
         cloud=cloud,
         model=model,
         identification=identification.to_builtins(),
@@ -123,7 +141,7 @@ def without_fit(reason: str) -> Fitted:
         offset=0.0,
         cloud=(),
         model=Model(explained_fraction=0.0, standard_error=None),
-        identification={"estimates": {}, "remarks": [reason]},
+        identification={"headline": reason, "estimates": {}, "remarks": []},
     )
 
 
@@ -156,43 +174,21 @@ def square_waves(fitted: Fitted, session: Session, seed: int) -> Search:
     return Search([restrict_to_whole_ticks(Range("frequency", low, high), session.tick)], seed)
 
 
-def search_square_waves(
-    session: Session,
-    search: Search,
-    budget: float,
-    before: Sequence[Tried],
-    add_trial: Callable[[Tried], None],
-) -> None:
-    """Try square waves until the budget is used [s].
-
-    before: square waves tried already; add_trial: called with each new one
-    """
-    last = None
-    for tried in before:
-        power = math.nan, math.nan  # the electrical power is unknown
-        last = Trial(
-            {"frequency": tried.frequency},
-            tried.thrust,
-            tried.thrust_ci95,
-            *power,
-            tried.swim_ticks,
-            tried.tank_time,
-        )
-        search.observe(last.parameters, last.thrust, last.thrust_ci95)
+def search_square_waves(session: Session, search: Search, budget: float) -> list[Wave]:
+    """Try square waves until the budget is used [s]."""
 
     def choose(_: float) -> Candidate:
         return Candidate(search.suggest())
 
-    for trial in measure_trials(session, "square", {}, choose, budget, last):
+    waves = []
+    for trial in measure_trials(session, SQUARE, {}, choose, budget):
         search.observe(trial.parameters, trial.thrust, trial.thrust_ci95)
-        frequency = trial.parameters["frequency"]
-        add_trial(
-            Tried(frequency, trial.thrust, trial.thrust_ci95, trial.swim_ticks, trial.tank_time)
-        )
+        waves.append(Wave(trial.parameters["frequency"], trial.thrust, trial.thrust_ci95))
+    return waves
 
 
 def best_of(
-    search: Search, tried: Sequence[Tried], fitted: Fitted, amplitude: float
+    search: Search, tried: Sequence[Wave], fitted: Fitted, amplitude: float
 ) -> tuple[float, bool]:
     """Return the frequency of the best square wave [Hz], and whether the identified fish is used.
 
@@ -227,13 +223,21 @@ def min_search_time(session: Session, search: Search) -> float:
     )
 
 
-def min_measurement_time(parameters: Mapping[str, Any]) -> float:
-    """Return the shortest time in which a gait can be measured, rests included [s]."""
-    frequency = float(parameters.get("frequency", 0.0))
-    swim = max(MEAN_SWIM_S, 1.5 + 3.0 / frequency) if frequency else MEAN_SWIM_S
-    seconds = 2.0 * swim + 3.0 * MEAN_REST_S
-    plan_of(seconds + 1e-6, parameters)
-    return seconds + 1e-6
+def share_time(left: float, gaits: Sequence[Contestant]) -> float:
+    """Return the length of the measurement of each gait, rests included [s].
+
+    left: time that is left of the tank time [s]
+    Raises `FishdError` where it is too short.
+    """
+    try:
+        for gait in gaits:
+            plan_of(left / len(gaits), gait.parameters)
+    except ParameterError as error:
+        raise FishdError(
+            f"{max(0.0, left):.0f} s are left of the tank time for {len(gaits)} gaits: {error}; a "
+            "larger --budget is needed"
+        ) from None
+    return left / len(gaits)
 
 
 def draw_cloud(
@@ -300,7 +304,7 @@ def training_settings(fitted: Fitted, steps: int, seed: int) -> TrainingSettings
         seed=seed,
         checkpoint_every=max(1, steps),
         environment=EnvironmentSettings(episode=EPISODE),
-        randomisation=Randomisation(fish=fitted.cloud, offset=min(10.0, fitted.offset)),
+        randomisation=Randomisation(fish=fitted.cloud, offset=fitted.offset),
         imitation=ImitationSettings(rounds=IMITATION_ROUNDS, fish=IMITATION_FISH),
         ppo=PpoSettings(decay_steps=max(1, steps)),
         evaluation=EvaluationSettings(every=EVALUATION_INTERVAL, others=OTHER_FISH, patience=None),

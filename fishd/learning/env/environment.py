@@ -13,7 +13,7 @@ An episode is truncated after `episode` steps, and never terminates: a fish has 
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium
@@ -24,13 +24,14 @@ from numpy.typing import NDArray
 from fishd.camera.simulated import SimulatedCameraSettings, TailPainter
 from fishd.config import Config, check_tethered
 from fishd.controllers.dwell import Dwell
-from fishd.controllers.policy.card import Feature, FeatureName, Window
+from fishd.controllers.policy.card import READING, Feature, FeatureName, Window
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import ConfigError
+from fishd.core.schema import Reading
 from fishd.core.signals import Observation, Truth
-from fishd.lab.links.link import Link, LinkLost
 from fishd.learning.env.perception import Perception
 from fishd.learning.extractors import FeatureExtractor, random_angles
+from fishd.learning.links.link import Link, LinkLost
 from fishd.learning.settings import EnvironmentSettings
 from fishd.virtual.plant.optimum import best_square_wave
 
@@ -76,7 +77,23 @@ def features(config: Config, settings: EnvironmentSettings) -> tuple[Feature, ..
         "previous_angle": config.amplitude_limit,
         "side_time": math.pi / omega0,
     }
-    return tuple(Feature(name, scales[name]) for name in settings.observation)
+    return (
+        *(Feature(name, scales[name]) for name in settings.observation),
+        *(_reading_feature(name, config.readings) for name in settings.readings),
+    )
+
+
+def _reading_feature(name: str, readings: Mapping[str, Reading]) -> Feature:
+    """Return the input for a reading: −1 to 1 between its limits; without both, its value."""
+    if name not in readings:
+        raise ConfigError(
+            f"environment.readings: the fish has no reading {name}; it has "
+            f"{', '.join(readings) or 'none'}"
+        )
+    low, high = readings[name].low, readings[name].high
+    if low is None or high is None or not low < high:
+        return Feature(READING + name, 1.0)
+    return Feature(READING + name, 0.5 * (high - low), 0.5 * (high + low))
 
 
 Vector = NDArray[np.float32]
@@ -251,12 +268,13 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         Raises `LinkLost`, and `ConfigError` where power has a price, but is not known.
         """
         before = self.latest.time
-        self.latest, lost, power = self.link.step(angle)
+        self.latest, lost = self.link.step(angle)
         if self._price:
+            power = self.latest.readings.get("power")
             if power is None:
                 raise ConfigError(
-                    "environment.power_price: the power of the servo is not known here: learn in "
-                    "simulation, or set it to 0"
+                    "environment.power_price: this fish has no reading power: learn in "
+                    "simulation, add a power meter to its sensors, or set it to 0"
                 )
             self._cost = self._price * power
         self.perception.note(self.latest)

@@ -15,9 +15,9 @@ from fishd.controllers.dwell import DwellLimit
 from fishd.core.camera_frames import Stack
 from fishd.core.signals import Observation
 from fishd.lab import simulation
-from fishd.lab.links.simulated_link import Camera, FunctionController
 from fishd.lab.simulation import Report, VirtualRun
 from fishd.learning.env.fish_variation import draw_edge_fish, draw_fish
+from fishd.learning.links.simulated_link import Camera, FunctionController
 from fishd.learning.settings import EvaluationSettings, TrainingSettings
 
 MIN_FULLNESS = 0.05

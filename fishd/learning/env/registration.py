@@ -49,10 +49,10 @@ def swim(
             "wrapper RenderCollection collects its pictures, RecordVideo writes them"
         )
     from fishd.camera import settings as cameras
-    from fishd.lab.links.simulated_link import Camera, SimulatedLink
     from fishd.learning.env.environment import SwimEnv
     from fishd.learning.env.fish_variation import episode_fish
     from fishd.learning.extractors import make_extractor
+    from fishd.learning.links.simulated_link import Camera, SimulatedLink
 
     fish = load(config, overrides)
     chosen = load_settings(settings)
@@ -97,9 +97,9 @@ def swim_on_daemon(
             f"render_mode={render_mode!r} is not valid: the true angles of this fish are unknown; "
             "leave it out, and see the fish with 'fishctl watch'"
         )
-    from fishd.lab.links.fishd_link import FishdLink, config_of
     from fishd.learning.env.environment import SwimEnv
     from fishd.learning.extractors import make_extractor
+    from fishd.learning.links.fishd_link import FishdLink, config_of
 
     chosen = load_settings(settings)
     fish = load(config, overrides) if config else adopt(config_of(endpoint), overrides)

@@ -13,9 +13,26 @@ from fishd.learning.run_folder.tables import SEEDS, read_evaluations
 
 
 def draw(path: Path, folder: Path) -> None:
-    """Draw the evaluations of a training into a file; raises `FishdError`."""
+    """Draw the evaluations of a training into a file; raises `FishdError`.
+
+    That is the thrust of the policy on its fish, and on the worst of the other fish if tried.
+    """
     with open_figure(path, (6.0, 4.0)) as figure:
-        draw_training(figure.subplots(), folder)
+        axis = figure.subplots()
+        evaluations = read_evaluations(folder)
+        if not _prepare(axis, "training", evaluations):
+            return
+        steps = [evaluation.steps for evaluation in evaluations]
+        ours = [evaluation.relative_thrust for evaluation in evaluations]
+        worst = [evaluation.lowest_relative_thrust for evaluation in evaluations]
+        for shares, label, colour in (
+            (ours, "fish of the training", BLUE),
+            (worst, "worst fish tried", PURPLE),
+        ):
+            if any(share is not None for share in shares):
+                values = [100.0 * (math.nan if share is None else share) for share in shares]
+                axis.plot(steps, values, color=colour, marker=".", label=label)
+        axis.legend(loc="lower right")
 
 
 def draw_seeds(path: Path, folder: Path) -> None:
@@ -48,19 +65,3 @@ def _prepare(axis: Any, title: str, rows: Sequence[Any]) -> bool:
     if not rows:
         axis.text(0.5, 0.5, "no evaluation", ha="center", transform=axis.transAxes)
     return bool(rows)
-
-
-def draw_training(axis: Any, folder: Path) -> None:
-    """Draw the thrust of the policy on its fish, and on the worst of the other fish if tried."""
-    evaluations = read_evaluations(folder)
-    if not _prepare(axis, "training", evaluations):
-        return
-    steps = [evaluation.steps for evaluation in evaluations]
-    for shares, label, colour in (
-        ([evaluation.relative_thrust for evaluation in evaluations], "fish of the training", BLUE),
-        ([item.lowest_relative_thrust for item in evaluations], "worst fish tried", PURPLE),
-    ):
-        if any(share is not None for share in shares):
-            values = [100.0 * (math.nan if share is None else share) for share in shares]
-            axis.plot(steps, values, color=colour, marker=".", label=label)
-    axis.legend(loc="lower right")

@@ -10,8 +10,8 @@ from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.errors import ConfigError
 from fishd.lab.experiment import On
-from fishd.lab.links.simulated_link import Camera
 from fishd.learning.env.evaluation import Evaluation
+from fishd.learning.links.simulated_link import Camera
 from fishd.learning.settings import Randomisation, TrainingSettings
 from fishd.virtual.plant.batch import is_possible
 

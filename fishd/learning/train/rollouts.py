@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 
-from fishd.lab.links.link import LinkLost
 from fishd.learning.env.environment import SwimEnv, Vector
 from fishd.learning.env.evaluation import beat_frequency
+from fishd.learning.links.link import LinkLost
 from fishd.learning.ppo import MeanAction, Rollout
 from fishd.learning.train.progress import Display
 

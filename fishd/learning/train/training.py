@@ -21,9 +21,6 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from fishd.core.errors import FishdError
-from fishd.lab.links.fishd_link import FishdLink
-from fishd.lab.links.link import Link, LinkLost
-from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning import extractors
 from fishd.learning.batched_imitation import BatchedImitation
 from fishd.learning.env import evaluation
@@ -31,6 +28,9 @@ from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.fish_variation import episode_fish
 from fishd.learning.imitation import Imitation
+from fishd.learning.links.fishd_link import FishdLink
+from fishd.learning.links.link import Link, LinkLost
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.ppo import DeterministicPolicy, Rollout, is_finite, learning_rate, make_learner
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.checkpoints import CheckpointError

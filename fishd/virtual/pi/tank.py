@@ -120,7 +120,7 @@ class Tank:
             state = self._fish.state
         return Truth(alpha=state.alpha, alpha_rate=state.alpha_rate, phi=state.phi)
 
-    def angle(self, time: float) -> float | None:
+    def instruction_angle(self, time: float) -> float | None:
         """Return the instruction angle [rad] of the pulse at a time [s]; None without pulses."""
         width = self._pulse(time)
         return (width - self._settings.servo_centre) / self._settings.servo_scale if width else None
@@ -142,10 +142,10 @@ class Tank:
         fish = self._fish
         while self._now < until:
             now = self._now
-            angle = self._angle_at(now)
-            end = self._next_change(angle, min(until, now + _MAX_PIECE_STEPS))
+            instruction_angle = self._angle_at(now)
+            end = self._next_change(instruction_angle, min(until, now + _MAX_PIECE_STEPS))
             rate = fish.state.alpha_rate
-            window = fish.advance(angle, (end - now) * STEP, 1)
+            window = fish.advance(instruction_angle, (end - now) * STEP, 1)
             duration = window.duration
             self._steps += end - now
             self._now = end
@@ -163,16 +163,16 @@ class Tank:
         return impulse_x, impulse_y
 
     def _angle_at(self, step: int) -> float | None:
-        return self.angle(step * STEP + _ROUNDING_S)
+        return self.instruction_angle(step * STEP + _ROUNDING_S)
 
-    def _next_change(self, angle: float | None, until: int) -> int:
+    def _next_change(self, instruction_angle: float | None, until: int) -> int:
         """Return the step, at most `until`, up to which the pulses command this angle."""
-        if self._angle_at(until) == angle:
+        if self._angle_at(until) == instruction_angle:
             return until
         unchanged, changed = self._now, until
         while changed - unchanged > 1:
             middle = (unchanged + changed) // 2
-            if self._angle_at(middle) == angle:
+            if self._angle_at(middle) == instruction_angle:
                 unchanged = middle
             else:
                 changed = middle

@@ -60,7 +60,7 @@ class PiState(Struct, frozen=True):
     """TCP port of its pigpiod."""
     pulse: float
     """Servo pulse [µs]; 0 without pulses."""
-    angle: float | None
+    phi_c: float | None
     """Instruction angle of the pulse [rad]; None without pulses."""
     truth: Truth
     """True state of the fish at the end of the latest conversion."""
@@ -171,7 +171,7 @@ class VirtualPi:
         return PiState(
             pigpio_port=self.pigpiod.port,
             pulse=self.pigpiod.width(self.settings.servo_gpio, now),
-            angle=self.tank.angle(now),
+            phi_c=self.tank.instruction_angle(now),
             truth=self.tank.truth(),
             faults=self.faults.listing(),
             levels=dict(self._levels),

@@ -120,9 +120,3 @@ class Plant(ABC, Generic[P]):
         None means no pulses: the wheel then keeps its angle. The sampled means are those of
         `samples` equally spaced instants, at which an ADC would be read.
         """
-
-    def prepare(self, instruction_angle: float | None, duration: float, samples: int) -> None:
-        """Compute in advance what the next call of `advance` with these arguments may need.
-
-        Called between the ticks of a loop in real time, and only for the plant of fishd itself.
-        """

@@ -24,7 +24,7 @@ MIN_HALF_BEAT_FRACTION, MAX_HALF_BEAT_FRACTION = 0.6, 0.8
 class Part(NamedTuple):
     """Part of a window with one instruction at the servo."""
 
-    angle: float | None  # rad; None for no pulses
+    instruction_angle: float | None  # rad; None for no pulses
     begin: float  # s, from the start of the window
     end: float
 
@@ -40,20 +40,22 @@ class DelayLine:
         self._delayed: deque[tuple[float, float | None]] = deque()
         """Times until arrival [s], and angles of the delayed instructions."""
 
-    def advance(self, angle: float | None, duration: float) -> list[Part]:
+    def advance(self, instruction_angle: float | None, duration: float) -> list[Part]:
         """Hold an instruction [rad] for `duration` s, and return the instructions at the servo."""
-        if angle != self._last_angle:
-            self._last_angle = angle
-            self._delayed.append((self._delay, angle))
+        if instruction_angle != self._last_angle:
+            self._last_angle = instruction_angle
+            self._delayed.append((self._delay, instruction_angle))
         parts, begin = [], 0.0
         while self._delayed and self._delayed[0][0] < duration:
-            arrives, angle = self._delayed.popleft()
+            arrives, instruction_angle = self._delayed.popleft()
             if arrives > begin:
                 parts.append(Part(self._servo_angle, begin, arrives))
-            self._servo_angle, begin = angle, arrives
+            self._servo_angle, begin = instruction_angle, arrives
         parts.append(Part(self._servo_angle, begin, duration))
         # Rounded, so that only few different lengths of time occur.
-        self._delayed = deque((round(t - duration, 9), angle) for t, angle in self._delayed)
+        self._delayed = deque(
+            (round(t - duration, 9), instruction_angle) for t, instruction_angle in self._delayed
+        )
         return parts
 
 

@@ -39,7 +39,7 @@ _MAX_BEATS = 200
 
 
 class SteadyState(NamedTuple):
-    """Result of a periodic command after the decay of transients."""
+    """Result of a periodic wave after the decay of transients."""
 
     frequency: float  # Hz
     thrust: float  # mean of F_x over a period, N

@@ -48,8 +48,8 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         ServoLaw,
         note(
             "Law by which the wheel approaches its instruction: its speed is Ω tanh(lag/Δ); or Ω, "
-            "and below a lag Δ `linear` in it or proportional to its `square-root`; or with an "
-            "acceleration of Ω²/2Δ at most (`accelerating`)."
+            "and below a lag Δ `linear` in it or in its `square-root`; or with an acceleration of "
+            "Ω²/2Δ at most (`accelerating`)."
         ),
     ] = "tanh"
     thrust_coefficient: Annotated[

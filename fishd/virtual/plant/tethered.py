@@ -167,10 +167,12 @@ class TetheredFish(Plant[PlantParameters]):
             parts = self._line.advance(instruction_angle, duration)
         windows = []
         for part in parts:
-            turn = part.begin + self._time_to_turn(part.angle)
+            turn = part.begin + self._time_to_turn(part.instruction_angle)
             ends = (turn, part.end) if part.begin < turn < part.end else (part.end,)
             for begin, end in pairwise((part.begin, *ends)):
-                windows.append(self._advance_part(part.angle, duration, samples, (begin, end)))
+                windows.append(
+                    self._advance_part(part.instruction_angle, duration, samples, (begin, end))
+                )
         if len(windows) == 1:
             return windows[0]
         return FinWindow(
@@ -184,14 +186,6 @@ class TetheredFish(Plant[PlantParameters]):
             [drive for w in windows for drive in w.drives],
         )
 
-    def prepare(self, instruction_angle: float | None, duration: float, samples: int) -> None:
-        """Compute the held windows of which the next one may be the first."""
-        if self._is_plain and instruction_angle is not None:
-            request = (instruction_angle, duration, samples)
-            counted = self._request, self._request_windows, self._mean_request_windows
-            if not self._is_known(request) and self._hold(*request) is None:
-                self._request, self._request_windows, self._mean_request_windows = counted
-
     def _is_known(self, request: tuple[float, float, int]) -> bool:
         """Return whether the next held window is that of a request from the present state."""
         held = self._held
@@ -202,13 +196,13 @@ class TetheredFish(Plant[PlantParameters]):
             and self._request == request
         )
 
-    def _hold(self, angle: float, duration: float, samples: int) -> HeldWindows | None:
+    def _hold(self, instruction_angle: float, duration: float, samples: int) -> HeldWindows | None:
         """Return the next windows; None where the instruction may soon change.
 
         An instruction is expected to last as long as recent ones, or twice its current duration.
         """
         self._held = None
-        request = (angle, duration, samples)
+        request = (instruction_angle, duration, samples)
         if request == self._request:
             self._request_windows += 1
         else:
@@ -224,19 +218,21 @@ class TetheredFish(Plant[PlantParameters]):
         ):
             return None
         p, state = self.parameters, self.state
-        lag = (angle - state.phi) / p.servo_lag
+        lag = (instruction_angle - state.phi) / p.servo_lag
         segments = self._equal_segments(duration, samples, (0.0, duration))
         if len(segments) > 1 or duration > self._graded_from or abs(lag) > _MAX_SINH_LAG:
             return None
         self._held = held = self._matrices_for(segments[0], samples).swim(
-            state, p.coupling * angle, lag
+            state, p.coupling * instruction_angle, lag
         )
         self._expected = state
         if self._motor:
             held.jump = self._motor.jump(self._speed, math.tanh(lag))
         return held
 
-    def _next_held_window(self, held: HeldWindows, angle: float, duration: float) -> HeldWindow:
+    def _next_held_window(
+        self, held: HeldWindows, instruction_angle: float, duration: float
+    ) -> HeldWindow:
         """Return the next window of a constant instruction."""
         p, k = self.parameters, held.taken
         held.taken += 1
@@ -244,16 +240,20 @@ class TetheredFish(Plant[PlantParameters]):
             self._request_windows += 1
         alpha, rate, side_force, sampled_side_force = held.ends[k]
         thrust, sampled_thrust = held.thrusts[k]
-        lag = math.sinh((angle - self.state.phi) / p.servo_lag)
+        lag = math.sinh((instruction_angle - self.state.phi) / p.servo_lag)
         lag = math.asinh(held.stretch.segment.decay * lag)
         self._speed = math.tanh(lag)
-        self.state = self._expected = PlantState(angle - p.servo_lag * lag, alpha, rate)
+        self.state = self._expected = PlantState(instruction_angle - p.servo_lag * lag, alpha, rate)
         return HeldWindow(
             duration, thrust, side_force, sampled_thrust, sampled_side_force, held, k, self._motor
         )
 
     def _advance_part(
-        self, angle: float | None, window_length: float, samples: int, part: tuple[float, float]
+        self,
+        instruction_angle: float | None,
+        window_length: float,
+        samples: int,
+        part: tuple[float, float],
     ) -> FinWindow:
         """Advance by a part of a window with one instruction at the servo.
 
@@ -263,22 +263,22 @@ class TetheredFish(Plant[PlantParameters]):
         p = self.parameters
         duration = part[1] - part[0]
         phi, alpha, rate = start = self.state
-        command = phi if angle is None else angle
+        target = phi if instruction_angle is None else instruction_angle
         if p.servo_dead_zone:
-            command = self._apply_dead_zone(command, phi)
-        lag = (command - phi) / p.servo_lag
+            target = self._apply_dead_zone(target, phi)
+        lag = (target - phi) / p.servo_lag
         cuts: Sequence[float] = ()
         before = self._speed
         if self._is_tanh:
             after = math.tanh(lag)
             if lag and (duration > self._graded_from or not self.cables.taut):
-                cuts = self._cuts(command, phi, lag, duration)
+                cuts = self._cuts(target, phi, lag, duration)
         else:
-            if angle is None:
+            if instruction_angle is None:
                 self._speed = 0.0
             approach = Approach(p.servo_law, lag, self._speed)
             after = approach.first_speed
-            cuts = self._cuts_of(approach, command, phi, duration)
+            cuts = self._cuts_of(approach, target, phi, duration)
         segments: Sequence[Segment] = (
             self._segments(window_length, samples, part, cuts)
             if cuts
@@ -287,7 +287,7 @@ class TetheredFish(Plant[PlantParameters]):
 
         responses: Sequence[Vector] = ()
         if self._brakes:
-            segments, responses = self._cut_at_turns(segments, command, lag)
+            segments, responses = self._cut_at_turns(segments, target, lag)
         cause = self._cause
         course: list[Stretch] = []
         thrust = sampled_thrust = sampled_acceleration = sampled_rate = 0.0
@@ -295,7 +295,7 @@ class TetheredFish(Plant[PlantParameters]):
         momentum = self._momentum
         for segment in segments:
             cause[0], cause[1] = alpha, rate
-            lags, lag, motion = self._drive(segment, command, lag)
+            lags, lag, motion = self._drive(segment, target, lag)
             # dot() has half the overhead of @.
             response = responses[len(course)] if responses else segment.response.dot(cause)
             course.append(Stretch(segment, response, lags, self._pulls, motion))
@@ -311,11 +311,11 @@ class TetheredFish(Plant[PlantParameters]):
                 braking += integral
                 sampled_braking += total
 
-        pulsed = angle is not None
+        pulsed = instruction_angle is not None
         drives = ((before, after, course),) if pulsed else ()
         if self._is_tanh or not pulsed:
             self._speed = math.tanh(lag) if pulsed else 0.0
-        self.state = PlantState(command - p.servo_lag * lag, alpha, rate)
+        self.state = PlantState(target - p.servo_lag * lag, alpha, rate)
         inertia, drag = p.thrust_coefficient, p.lateral_drag
         side_inertia = p.lateral_inertia_ratio * inertia
         reaction = self._momentum - momentum
@@ -339,7 +339,7 @@ class TetheredFish(Plant[PlantParameters]):
         )
 
     def _cut_at_turns(
-        self, segments: Sequence[Segment], command: float, lag: float
+        self, segments: Sequence[Segment], target: float, lag: float
     ) -> tuple[Sequence[Segment], Sequence[Vector]]:
         """Cut segments at reversals of the fin, and return the parts with their responses.
 
@@ -354,7 +354,7 @@ class TetheredFish(Plant[PlantParameters]):
             segment = to_do.pop()
             cause[0], cause[1] = alpha, rate
             tail, speed = self.cables.tail, self._speed
-            _, later, _ = self._drive(segment, command, lag)
+            _, later, _ = self._drive(segment, target, lag)
             response = (
                 segment.braked(cause, self._drag) if self._drag else segment.response.dot(cause)
             )
@@ -371,21 +371,21 @@ class TetheredFish(Plant[PlantParameters]):
         self.cables.tail, self._momentum, self._speed = before
         return pieces, responses
 
-    def _apply_dead_zone(self, angle: float, phi: float) -> float:
+    def _apply_dead_zone(self, target: float, phi: float) -> float:
         """Return the angle that the wheel approaches [rad]: the edge of its dead zone."""
         dead = self.parameters.servo_dead_zone
-        return phi if abs(angle - phi) <= dead else angle - math.copysign(dead, angle - phi)
+        return phi if abs(target - phi) <= dead else target - math.copysign(dead, target - phi)
 
-    def _time_to_turn(self, angle: float | None) -> float:
+    def _time_to_turn(self, instruction_angle: float | None) -> float:
         """Return the time until an accelerating wheel turns that moves away from its angle [s]."""
         p = self.parameters
-        if p.servo_law != "accelerating" or angle is None:
+        if p.servo_law != "accelerating" or instruction_angle is None:
             return 0.0
-        gap = self._apply_dead_zone(angle, self.state.phi) - self.state.phi
+        gap = self._apply_dead_zone(instruction_angle, self.state.phi) - self.state.phi
         return Approach(p.servo_law, gap / p.servo_lag, self._speed).turn * self._servo_time
 
     def _drive(
-        self, segment: Segment, command: float, lag: float
+        self, segment: Segment, target: float, lag: float
     ) -> tuple[Vector, float, tuple[Vector, Vector] | None]:
         """Write the drive of the fin into the cause.
 
@@ -410,27 +410,27 @@ class TetheredFish(Plant[PlantParameters]):
             later = relax(lag, length)
         if p.servo_reaction:
             self._react(segment, motion[0] if motion else np.tanh(lags))
-        cause[2] = p.coupling * command
+        cause[2] = p.coupling * target
         if self.cables.taut:
             cause[3:] = lags
         else:
             if self._is_tanh:
                 halfway = relax(lag, 0.5 * length)
-            self._pull(command, halfway, lags, later)
+            self._pull(target, halfway, lags, later)
         return lags, later, motion
 
-    def _pull(self, command: float, halfway: float, lags: Vector, later: float) -> None:
+    def _pull(self, target: float, halfway: float, lags: Vector, later: float) -> None:
         """Apply backlash and slack to the drive of the fin during a segment.
 
         lags, halfway, later: lag/Δ of the wheel at the nodes, at the middle and at the end
         """
         p, cause = self.parameters, self._cause
         moves, angle = self.cables.pull(
-            command - p.servo_lag * halfway, command - p.servo_lag * later
+            target - p.servo_lag * halfway, target - p.servo_lag * later
         )
         self._pulls = moves
         if moves:
-            cause[2], cause[3:] = p.coupling * (command - angle), lags
+            cause[2], cause[3:] = p.coupling * (target - angle), lags
         else:
             cause[2], cause[3:] = p.coupling * angle, 0.0
 
@@ -442,7 +442,7 @@ class TetheredFish(Plant[PlantParameters]):
         self._momentum *= math.exp(-segment.length / REACTION_TIME)
         self._momentum -= p.servo_reaction * p.servo_speed * pushed
 
-    def _cuts(self, command: float, phi: float, lag: float, duration: float) -> list[float]:
+    def _cuts(self, target: float, phi: float, lag: float, duration: float) -> list[float]:
         """Return the times (s) within the part at which segments must end."""
         p, unit = self.parameters, self._servo_time
         cuts = []
@@ -451,12 +451,12 @@ class TetheredFish(Plant[PlantParameters]):
             cuts = [unit * (transition + time) for time in _TRANSITION]
         if not self.cables.taut:
             for edge in self.cables.edges(phi, lag):
-                if min(phi, command) < edge < max(phi, command):
-                    cuts.append(unit * time_between(lag, (command - edge) / p.servo_lag))
+                if min(phi, target) < edge < max(phi, target):
+                    cuts.append(unit * time_between(lag, (target - edge) / p.servo_lag))
         return sorted({cut for cut in cuts if 0.0 < cut < duration}) if cuts else cuts
 
     def _cuts_of(
-        self, approach: Approach, command: float, phi: float, duration: float
+        self, approach: Approach, target: float, phi: float, duration: float
     ) -> list[float]:
         """Return the times (s) at which segments must end, for another law than tanh."""
         p, unit = self.parameters, self._servo_time
@@ -464,10 +464,10 @@ class TetheredFish(Plant[PlantParameters]):
         if p.servo_law == "linear" and duration > self._graded_from:
             times += [times[0] + time for time in _TRANSITION if time > 0.0]
         if not self.cables.taut:
-            end = command - p.servo_lag * float(approach.at(np.array([duration / unit]))[0][0])
+            end = target - p.servo_lag * float(approach.at(np.array([duration / unit]))[0][0])
             for edge in self.cables.edges(phi, end - phi):
                 if min(phi, end) < edge < max(phi, end):
-                    times.append(approach.time_to((command - edge) / p.servo_lag))
+                    times.append(approach.time_to((target - edge) / p.servo_lag))
         cuts = {round(unit * time, _DIGITS) for time in times}
         return sorted(cut for cut in cuts if 0.0 < cut < round(duration, _DIGITS))
 

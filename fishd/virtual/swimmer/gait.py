@@ -74,7 +74,7 @@ def gait(track: dict[str, Array], settings: SwimmerSettings) -> Gait:
     swimming direction.
     """
     time, x = track["time"], track["x"]
-    begins = upward_reversals(track["command"].tolist())
+    begins = upward_reversals(track["phi_c"].tolist())
     beats = max(0, len(begins) - 1)
     first, last = (begins[0], begins[-1]) if beats else (1, len(time))
     rows = slice(first, last)

@@ -75,7 +75,7 @@ class Swimmer:
         self._tick = tick
         self._start: float | None = None
         self._steps = 0
-        self._angle: float | None = None
+        self._instruction_angle: float | None = None
         self._phi = 0.0
         self._sensed_rate = 0.0
         lever = (TAIL_FRACTION - 0.5 * FRONT_FRACTION) * settings.body.length
@@ -136,10 +136,10 @@ class Swimmer:
 
     def _activation(self) -> float:
         """Return the activation of the next step; without pulses the muscles are relaxed."""
-        if self._angle is None:
+        if self._instruction_angle is None:
             self._phi = 0.0
         elif not self.settings.muscle.servo:
-            self._phi = self._angle
+            self._phi = self._instruction_angle
         else:  # value in the middle of the step
             middle = self._wheel_after(self._phi, 0.5 * self.fish.dt)
             self._phi = self._wheel_after(self._phi, self.fish.dt)
@@ -148,7 +148,7 @@ class Swimmer:
 
     def _wheel_after(self, phi: float, duration: float) -> float:
         """Return the angle of the wheel at `phi` after `duration` s [rad]."""
-        plant, angle = self._plant, self._angle or 0.0
+        plant, angle = self._plant, self._instruction_angle or 0.0
         lag = (angle - phi) / plant.servo_lag
         return angle - plant.servo_lag * relax(lag, duration * plant.servo_speed / plant.servo_lag)
 
@@ -162,17 +162,17 @@ class Swimmer:
         return self.fish.work
 
     @property
-    def command(self) -> float:
+    def instruction_angle(self) -> float:
         """Current instruction angle; 0 where the muscles are relaxed [rad]."""
-        return self._angle or 0.0
+        return self._instruction_angle or 0.0
 
-    def write(self, angle: float) -> None:
+    def write(self, instruction_angle: float) -> None:
         """Set the instruction angle [rad] from the latest read onwards."""
-        self._angle = angle
+        self._instruction_angle = instruction_angle
 
     def release(self) -> None:
         """Relax the muscles."""
-        self._angle = None
+        self._instruction_angle = None
 
     def close(self) -> None:
         """Relax the muscles."""
@@ -198,13 +198,13 @@ class Swimmer:
 
     def state(self) -> dict[str, Array]:
         """Return the complete state by name."""
-        angle = math.nan if self._angle is None else self._angle
+        angle = math.nan if self._instruction_angle is None else self._instruction_angle
         return self.fish.state() | {"robot": np.array([angle, self._phi, self._sensed_rate])}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Restore a result of `state` exactly."""
         self.fish.restore(state)
         angle, self._phi, self._sensed_rate = map(float, state["robot"])
-        self._angle = None if math.isnan(angle) else angle
+        self._instruction_angle = None if math.isnan(angle) else angle
         self.motion = self.fish.motion()
         self.tail_reach = (self.motion.tail_y, self.motion.tail_y)

@@ -26,7 +26,7 @@ COLUMNS = {
     "tail_rate": ("rad/s", "rate of tail_angle, not filtered"),
     "tail_lowest": ("m", "smallest y of the tip of the tail during the tick, in the laboratory"),
     "tail_highest": ("m", "largest y of the tip of the tail during the tick, in the laboratory"),
-    "command": ("rad", "instruction angle φ_c during the tick"),
+    "phi_c": ("rad", "instruction angle φ_c during the tick"),
     "activation": ("1", "activation a in the last step of the tick"),
     "thrust": ("N/m", "mean force of the water along −x"),
     "side_force": ("N/m", "mean force of the water along y"),
@@ -57,8 +57,8 @@ class Track:
         """Start the powers with the work from now on."""
         self._before = swimmer.work
 
-    def add(self, swimmer: "Swimmer", command: float) -> None:
-        """Add the latest tick; command: φ_c during the tick [rad]."""
+    def add(self, swimmer: "Swimmer", instruction_angle: float) -> None:
+        """Add the latest tick; instruction_angle: the one during the tick [rad]."""
         motion, window, work = swimmer.motion, swimmer.window, swimmer.work
         before = self._before or work
         self._before = work
@@ -77,7 +77,7 @@ class Track:
             "tail_rate": motion.tail_rate,
             "tail_lowest": lowest,
             "tail_highest": highest,
-            "command": command,
+            "phi_c": instruction_angle,
             "activation": swimmer.fish.activation,
             "thrust": window.thrust,
             "side_force": window.side_force,

@@ -1,4 +1,4 @@
-"""Server of the page of the camera: three files, and a WebSocket that sends pictures and facts.
+"""Server of the page of a camera: its files, and a WebSocket that sends pictures and a text.
 
 No request changes anything.
 """
@@ -8,7 +8,6 @@ from importlib import resources
 
 from aiohttp import web
 
-from fishd.window.camera_page.feed import News
 from fishd.window.viewer import Viewer
 from fishd.window.web_server import WebServer, file_routes
 
@@ -18,19 +17,19 @@ class PageServer(WebServer):
 
     def __init__(self, host: str, port: int) -> None:
         """host: address to listen at; port: 0 for any free port"""
-        self._news = News(b"{}", None)
+        self._newest: dict[type, str | bytes] = {}
         self._pages: set[_CameraViewer] = set()
         files = file_routes(resources.files(__package__), "page.html")
         super().__init__(host, port, [*files, web.get("/live", self._live)])
 
-    def show(self, news: News) -> None:
-        """Send an update to all pages."""
-        self._news = News(news.facts, self._news.jpeg if news.jpeg is None else news.jpeg)
+    def show(self, message: str | bytes) -> None:
+        """Send a text, or a JPEG, to all pages."""
+        self._newest[type(message)] = message
         for page in self._pages:
-            page.show(news)
+            page.show(message)
 
     async def _live(self, request: web.Request) -> web.StreamResponse:
-        page = _CameraViewer(self._news)
+        page = _CameraViewer(self._newest)
         self._pages.add(page)
         try:
             return await self.serve_viewer(request, page)
@@ -39,25 +38,18 @@ class PageServer(WebServer):
 
 
 class _CameraViewer(Viewer):
-    """One open page; a slow one misses updates."""
+    """One open page; a slow one misses texts and pictures."""
 
-    def __init__(self, first: News) -> None:
+    def __init__(self, newest: dict[type, str | bytes]) -> None:
         super().__init__()
-        self._news: News | None = first
+        self._messages = dict(newest)
 
-    def show(self, news: News) -> None:
-        """Send an update next; it replaces one that still waits, but not the picture by none."""
-        if news.jpeg is None and self._news is not None:
-            news = News(news.facts, self._news.jpeg)
-        self._news = news
+    def show(self, message: str | bytes) -> None:
+        """Send a message next; it replaces one of its kind that still waits."""
+        self._messages[type(message)] = message
         self.wake()
 
-    def take(self) -> Iterable[bytes]:
-        """Return the newest update, if it was not sent."""
-        news, self._news = self._news, None
-        return [] if news is None else [_encode_news(news)]
-
-
-def _encode_news(news: News) -> bytes:
-    """Return an update as one message: length of the facts, the facts, and the JPEG."""
-    return len(news.facts).to_bytes(4, "big") + news.facts + (news.jpeg or b"")
+    def take(self) -> Iterable[str | bytes]:
+        """Return the messages that wait, and forget them."""
+        messages, self._messages = self._messages, {}
+        return messages.values()

@@ -1,7 +1,7 @@
 // The page: its state, what the stream says about it, the header with the E-stop, and the values.
 import {
   call, duration, forceUnit, html, interval, number, parametersText, recall, remember, render, sentence, setClient,
-  timeOfDay, useState,
+  significant, timeOfDay, unitText, useState,
 } from "./common.js";
 import { Charts } from "./charts.js";
 import { defaultOf, Drive, driverName, request, selectionOf } from "./controls.js";
@@ -456,7 +456,9 @@ function Values() {
     ${tick?.speed !== undefined && html`<${Card} title="Speed" value=${number(1000 * tick.speed, 1)} unit="mm/s" note="true speed of the simulated fish" />`}
     <${Card} title="Relative thrust" value=${relative} extra=${relativeError} unit=${reference ? "%" : ""} note=${reference?.text ?? ""}>
       <button type="button" class="link" disabled=${!tick} onClick=${setReference}>${reference ? "again" : "take this as 100 %"}</button><//>
-    <${Card} title="Servo power" value=${number(status?.power ?? NaN, 2)} unit=${status?.power == null ? "" : "W"} note=${!status ? "" : status.power == null ? "no power meter" : "mean of 2 s"} />
+    ${Object.entries(status?.readings ?? {}).map(([name, reading]) => html`<${Card} key=${name} title=${sentence(name.replaceAll("_", " ")).slice(0, -1)}
+      value=${significant(reading.value ?? NaN, 4)} unit=${reading.value == null ? "" : unitText(reading.unit)}
+      level=${reading.problem ? "warn" : ""} note=${reading.problem ?? "mean of 2 s"} />`)}
     <${Card} title="Controller" value=${status ? (status.mode === "running" ? status.controller : "none") : "–"}
       note=${status ? (status.mode === "running" ? ownText(status.controller, status.parameters) || "default parameters" : status.servo_on ? "servo at neutral" : "servo without pulses") : ""} />
     <${Card} title="Sensor age" value=${number(age, 1)} unit="ms" level=${age > 2 * period ? "warn" : ""}

@@ -1,9 +1,10 @@
 // The charts: one uPlot each, made once; only their data, titles and ranges change.
 import { forceUnit, number, unitText } from "./common.js";
-import { QUANTITY } from "./stream.js";
+import { QUANTITY, READING } from "./stream.js";
 
 const HEIGHT = 132;
-const QUANTITY_CHARTS = 8;
+/** Number of charts for the quantities of a controller and the readings of sensors. */
+const NAMED_CHARTS = 20;
 const FRAME_MS = 50;
 /** A range shrinks when its values fill less than this fraction of it. */
 const SHRINK = 0.45;
@@ -277,14 +278,14 @@ export class Charts {
     this.gaps = [];
     this.limits = null;
     this.virtual = null;
-    this.quantityNames = "";
+    this.names = "";
     this.charts = CHARTS.map((definition, index) => new Chart(parent, { ...definition, labelled: index === 0 }, this));
-    this.quantityCharts = Array.from({ length: QUANTITY_CHARTS }, () => new Chart(parent, {
+    this.namedCharts = Array.from({ length: NAMED_CHARTS }, () => new Chart(parent, {
       title: [""], series: [line("", "fin")],
     }, this));
-    for (const chart of this.quantityCharts) chart.show(false);
+    for (const chart of this.namedCharts) chart.show(false);
     this.#makeVirtualChart();
-    this.all = [...this.charts, ...this.quantityCharts];
+    this.all = [...this.charts, ...this.namedCharts];
     this.drawn = 0;
     this.dirty = true;
     new ResizeObserver(() => this.all.forEach((chart) => chart.size())).observe(parent);
@@ -323,24 +324,27 @@ export class Charts {
     return Array.from({ length: Math.round(this.seconds / step) + 1 }, (_, index) => index * step).reverse();
   }
 
-  /** Fit units, limits and the quantities of the controller to the status. */
+  /** Fit units, limits, quantities of the controller and readings of sensors to the status. */
   setStatus(status, controller) {
     const [factor, unit] = forceUnit(status);
     for (const chart of this.charts) if (chart.definition.force) chart.setUnit(unit, factor);
     this.limits = status ? [status.lowest_angle, status.highest_angle] : null;
-    const quantities = controller?.quantities ?? [];
-    const names = quantities.map(({ name }) => name).join();
-    if (names === this.quantityNames) return;
-    this.quantityNames = names;
-    this.quantityCharts.forEach((chart, index) => {
-      const quantity = quantities[index];
-      chart.known = quantity !== undefined;
-      if (!quantity) return chart.show(false);
-      chart.definition.title = [`${controller.name}: ${quantity.name.replaceAll("_", " ")}`];
-      chart.definition.series[0].column = QUANTITY + quantity.name;
-      chart.unit = unitText(quantity.unit);
+    const named = [
+      ...(controller?.quantities ?? []).map(({ name, ...about }) => ({ ...about, column: QUANTITY + name, title: `${controller.name}: ${name}` })),
+      ...Object.entries(status?.readings ?? {}).map(([name, about]) => ({ ...about, column: READING + name, title: name })),
+    ];
+    const names = named.map(({ column }) => column).join();
+    if (names === this.names) return;
+    this.names = names;
+    this.namedCharts.forEach((chart, index) => {
+      const entry = named[index];
+      chart.known = entry !== undefined;
+      if (!entry) return chart.show(false);
+      chart.definition.title = [entry.title.replaceAll("_", " ")];
+      chart.definition.series[0].column = entry.column;
+      chart.unit = unitText(entry.unit);
       chart.setTitle(chart.definition.title);
-      chart.root.title = quantity.description;
+      chart.root.title = entry.description;
     });
     this.dirty = true;
   }
@@ -370,7 +374,7 @@ export class Charts {
       chart.show(chart.known);
       chart.size();
     }
-    for (const chart of this.quantityCharts) {
+    for (const chart of this.namedCharts) {
       if (chart.known && chart.root.hidden && ring.has(chart.definition.series[0].column)) {
         chart.show(true);
         chart.size();

@@ -7,8 +7,8 @@ const KEPT_S = 120;
 const MAX_ROWS = 24_000;
 const MAX_COLUMNS = 64;
 const CLOCK_JUMP_S = 1;
-/** Prefix of the column of a controller's quantity. */
-export const QUANTITY = "quantity:";
+/** Prefixes of the columns of a controller's quantity and of a sensor's reading. */
+export const QUANTITY = "quantity:", READING = "reading:";
 
 /** Columns of fixed length with the latest ticks; a row of NaN where ticks were lost. */
 export class Ring {
@@ -49,6 +49,7 @@ export class Ring {
       if (typeof tick[name] === "number" && (name !== "phi_c" || tick.servo_on !== false)) this.#write(name, tick[name]);
     }
     for (const name in tick.quantities) this.#write(QUANTITY + name, tick.quantities[name]);
+    for (const name in tick.readings) this.#write(READING + name, tick.readings[name]);
     if (tick.suspect) {
       this.#write("suspect_fx", tick.fx);
       this.#write("suspect_fy", tick.fy);
@@ -116,12 +117,14 @@ export class Ring {
 
 /** Yield the ticks that columns hold. */
 export function* ticksOf(history) {
-  const { quantities = {}, ...columns } = history;
+  const { quantities = {}, readings = {}, ...columns } = history;
   for (let row = 0; row < columns.seq.length; row++) {
     const tick = {};
     for (const name in columns) if (columns[name][row] != null) tick[name] = columns[name][row];
-    const own = Object.entries(quantities).filter(([, column]) => column[row] != null);
-    if (own.length) tick.quantities = Object.fromEntries(own.map(([name, column]) => [name, column[row]]));
+    for (const [kind, named] of Object.entries({ quantities, readings })) {
+      const own = Object.entries(named).filter(([, column]) => column[row] != null);
+      if (own.length) tick[kind] = Object.fromEntries(own.map(([name, column]) => [name, column[row]]));
+    }
     yield tick;
   }
 }

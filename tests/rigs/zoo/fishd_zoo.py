@@ -158,10 +158,6 @@ class Zoo(Controller[ZooParameters]):
         _act("retune", parameters)
         super().retune(parameters)
 
-    def warm_up(self) -> None:
-        """Misbehave before the tick."""
-        _act("warm_up", self.parameters)
-
     def close(self) -> None:
         """Misbehave at the end."""
         _act("close", self.parameters)

@@ -1,6 +1,5 @@
 """Settings of `fishd-camera`: an error is one line that names its place."""
 
-import os
 from pathlib import Path
 
 import msgspec
@@ -56,16 +55,6 @@ def test_a_wrong_file_is_named_with_its_line(tmp_path: Path) -> None:
     done = call(*COMMAND, "--config", str(file))
     assert done.returncode == 78
     assert f"{file}:3: v4l2.widht: unknown key" in one_line(done)
-
-
-@pytest.mark.parametrize("module", ["cv2", "linuxpy"])
-def test_a_package_that_is_missing_is_said_in_one_line(tmp_path: Path, module: str) -> None:
-    blocked = f"import sys\nsys.modules[{module!r}] = None\n"
-    (tmp_path / "sitecustomize.py").write_text(blocked)
-    env = os.environ | {"PYTHONPATH": str(tmp_path)}
-    line = one_line(call(*COMMAND, "--set", "source=v4l2", env=env))
-    assert module in line
-    assert line.endswith("[camera]'\n")
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from rigs.camera_process import COMMAND, CameraProcess, running_camera
 from rigs.processes import PATIENCE, Daemon, call, running, sets, wait_until
 
 from fishd.camera import requests
-from fishd.camera.client import CameraClient, CameraLost
+from fishd.camera.client import CameraLost
 from fishd.camera.requests import CameraRequests, resolve_frames_address
 from fishd.cli.doctor import service
 from fishd.cli.doctor.base import Context
@@ -108,15 +108,11 @@ def test_within_a_tick_there_is_no_time_to_find_out_why_no_answer_comes(
     camera: CameraProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(requests, "_PUBLISHER_CHECK_MS", int(PATIENCE * 1e3))
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    try:
-        asking = CameraRequests(camera.frames, context, timeout=0.3)
+    with CameraRequests(camera.frames, timeout=0.3) as asking:
         with pytest.raises(CameraLost, match=r"no answer within 0\.05 s"):
             asking.status(0.05)
         with pytest.raises(CameraLost, match=r".+ is the address of a camera's frames"):
             asking.status()
-    finally:
-        context.destroy(linger=0)
 
 
 def test_views_are_drawn_for_whoever_wants_them_and_seldom(camera: CameraProcess) -> None:
@@ -137,11 +133,6 @@ def test_views_are_drawn_for_whoever_wants_them_and_seldom(camera: CameraProcess
         assert client.view is None
 
 
-def test_no_camera_is_said_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(CameraLost, match=r"no camera at ipc:\S+: no answer within 0.2 s; start"):
-        CameraClient(f"ipc://{tmp_path}/nobody", timeout=0.2)
-
-
 @pytest.mark.parametrize(
     ("frames", "endpoint", "seen"),
     [
@@ -160,7 +151,6 @@ def test_the_doctor_says_how_the_camera_is(
     camera.until(lambda state: state.rate > 0.0)  # a single frame has no rate
     monkeypatch.setenv("FISHD_CAMERA", camera.endpoint)
     check = service.camera(context)
-    assert check
     assert (check.level, check.message[:5]) == ("ok", "120.0")
     monkeypatch.setenv("FISHD_CAMERA", f"ipc://{tmp_path}/nobody")
     assert service.camera(context) is None

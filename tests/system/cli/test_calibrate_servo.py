@@ -56,9 +56,8 @@ def test_an_interrupted_servo_calibration_leaves_neutral_and_the_previous_calibr
     talk: Talk, rig: Bench, daemon: Daemon, how: int | None
 ) -> None:
     before = calibrations(daemon)
-    dialogue = talk(daemon, "calibrate", "servo")
-    dialogue.answer("trim +0 µs> ", "++")
-    dialogue.answer("trim +25 µs> ", "ok")
+    dialogue = begin_trim_of_25(talk, rig, daemon)
+    dialogue.answer("", "ok")
     dialogue.expect("again: ")
     rig.wait_for_pulse(1584, 1586)
     if how is not None:
@@ -77,9 +76,8 @@ def test_an_interrupted_servo_calibration_leaves_neutral_and_the_previous_calibr
 def test_a_calibration_ends_with_a_killed_fishctl(talk: Talk, rig: Bench, daemon: Daemon) -> None:
     before = calibrations(daemon)
     with Subscriber(daemon.telemetry, b"event") as events:
-        dialogue = talk(daemon, "calibrate", "servo")
-        dialogue.answer("trim +0 µs> ", "++")
-        dialogue.answer("trim +25 µs> ", "ok")
+        dialogue = begin_trim_of_25(talk, rig, daemon)
+        dialogue.answer("", "ok")
         dialogue.expect("again: ")
         rig.wait_for_pulse(1584, 1586)
         dialogue.process.kill()
@@ -91,9 +89,7 @@ def test_a_calibration_ends_with_a_killed_fishctl(talk: Talk, rig: Bench, daemon
 def test_an_operator_may_take_time_and_no_other_program_moves_the_fish_meanwhile(
     talk: Talk, rig: Bench, daemon: Daemon
 ) -> None:
-    dialogue = talk(daemon, "calibrate", "servo")
-    dialogue.answer("trim +0 µs> ", "++")
-    dialogue.expect("trim +25 µs> ")
+    dialogue = begin_trim_of_25(talk, rig, daemon)
     time.sleep(LEASE + 2.0)  # only fishctl renews the lease
     assert "\ncalibrating the servo, by a client\n" in daemon.fishctl("status").stdout
     swim, second = daemon.fishctl("set-controller", "swing"), daemon.fishctl("calibrate", "servo")
@@ -164,9 +160,7 @@ def test_a_fault_in_the_middle_ends_it_in_one_line_with_the_calibration_of_befor
     talk: Talk, rig: Bench, daemon: Daemon
 ) -> None:
     before = calibrations(daemon)
-    dialogue = talk(daemon, "calibrate", "servo")
-    dialogue.answer("trim +0 µs> ", "++")
-    dialogue.expect("trim +25 µs> ")
+    dialogue = begin_trim_of_25(talk, rig, daemon)
     rig.pi.inject("unplugged")
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         for status in iter(fish.status, None):

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line, running, sets, wait_until
+from rigs.processes import FISHCTL, Process, fishctl, one_line, running, sets, wait_until
 from rigs.virtual_pi_process import Pi, virtual_pi
 
 from fishd.cli.doctor.bench import analog
@@ -154,7 +154,6 @@ def test_a_bench_that_is_ended_ends_its_fishd(tmp_path: Path) -> None:
 
 def test_a_running_fishd_is_not_disturbed(tmp_path: Path) -> None:
     with virtual_pi(tmp_path) as pi, running(tmp_path, *pi.settings) as daemon:
-        assert isinstance(daemon, Daemon)
         own = sets(f"control.address={daemon.endpoint}")
         refused = one_line(fishctl("doctor", "--bench", "--yes", *pi.settings, *own))
     assert "fishd is running" in refused

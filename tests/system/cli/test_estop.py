@@ -6,7 +6,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from rigs.gateway_processes import both_gateways, fork_server
+from rigs.gateway_processes import gateway
 from rigs.operator_rig import Bench
 from rigs.processes import Daemon, fishctl, one_line, running
 
@@ -28,11 +28,10 @@ def test_the_control_socket_is_asked_first(pi: Bench) -> None:
     assert (state["way"], state["mode"]) == ("control socket", "estop")
 
 
-def test_gateways_that_are_stopped_do_not_keep_the_pulses_on(pi: Bench) -> None:
+def test_a_gateway_that_is_stopped_does_not_keep_the_pulses_on(pi: Bench) -> None:
     with pi.daemon() as daemon:
         swim(pi, daemon)
-        for pid in (fork_server(daemon), *both_gateways(daemon).values()):
-            os.kill(pid, signal.SIGSTOP)
+        os.kill(gateway(daemon), signal.SIGSTOP)
         ended = daemon.fishctl("estop")
         assert (ended.returncode, ended.stderr) == (0, "")
         assert (

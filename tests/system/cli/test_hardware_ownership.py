@@ -95,7 +95,6 @@ def test_a_claim_is_held_by_one_process_until_that_is_killed() -> None:
     )
     command = [sys.executable, "-c", holder, part.name]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "held\n"
         assert ownership.find_owner([part]) == (process.pid, os.geteuid())
         assert ownership.describe_owner([part]) == f"a fishd (pid {process.pid}) drives a part"

@@ -68,18 +68,6 @@ def test_fishd_on_a_pi_does_not_start_without_what_it_needs(
     assert re.fullmatch(complaint, ended.stderr)
 
 
-def test_release_names_the_package(tmp_path: Path, env: dict[str, str]) -> None:
-    ended = call(FISHCTL, "release", *sets("robot=pi", f"state_folder={tmp_path}"), env=env)
-    assert (ended.returncode, ended.stdout) == (1, "")
-    assert re.fullmatch(ONE_LINE % "pigpio", ended.stderr)
-
-
-def test_a_simulation_of_the_virtual_pi_names_the_package(env: dict[str, str]) -> None:
-    ended = call(FISHCTL, "simulate", "hold", "--set", "robot=virtual-pi", env=env)
-    assert ended.returncode == 1
-    assert re.fullmatch(ONE_LINE % "adafruit-extended-bus", ended.stderr)
-
-
 def test_no_check_of_doctor_breaks_off(pi: Bench, env: dict[str, str]) -> None:
     ended = call(FISHCTL, "doctor", "--json", *pi.settings, *addresses(pi.folder), env=env)
     assert (ended.returncode, ended.stderr) == (1, "")
@@ -114,18 +102,27 @@ def test_training_without_the_extra_names_it_in_a_line(tmp_path: Path, missing: 
     assert (shown.returncode, "--resume" in shown.stdout) == (0, True)
 
 
-@pytest.mark.parametrize("module", ["onnx", "onnxruntime"])
-def test_an_agent_names_the_extra_that_policies_need(tmp_path: Path, module: str) -> None:
-    done = call(FISHCTL, "agent", "default-fish", env=environment_without(tmp_path, module))
-    assert (done.returncode, done.stdout) == (1, "")
-    assert re.fullmatch(
-        rf"fishctl: {module} is not installed; install it with: [^\n]+\[policy\]'\n", done.stderr
-    )
+NOT_INSTALLED = r"fishctl: %s is not installed; [^\n]*\[%s\]'\n"
 
 
-@pytest.mark.parametrize(("module", "verb"), [("aiohttp", ("page",)), ("mcap", ("record", "run"))])
-def test_a_camera_verb_names_its_extra(tmp_path: Path, module: str, verb: tuple[str, ...]) -> None:
-    done = call(FISHCTL, "camera", *verb, env=environment_without(tmp_path, module))
-    extra = "camera" if module == "aiohttp" else "record"
+@pytest.mark.parametrize(
+    ("line", "missing", "complaint"),
+    [
+        ("fishd-camera --set source=v4l2", ["cv2"], r"[^\n]*cv2[^\n]*\[camera\]'\n"),
+        ("fishd-camera --set source=v4l2", ["linuxpy"], r"[^\n]*linuxpy[^\n]*\[camera\]'\n"),
+        ("release --set robot=pi", MODULES, ONE_LINE % "pigpio"),
+        ("simulate hold --set robot=virtual-pi", MODULES, ONE_LINE % "adafruit-extended-bus"),
+        ("agent default-fish", ["onnx"], NOT_INSTALLED % ("onnx", "policy")),
+        ("agent default-fish", ["onnxruntime"], NOT_INSTALLED % ("onnxruntime", "policy")),
+        ("camera page", ["aiohttp"], NOT_INSTALLED % ("aiohttp", "camera")),
+        ("record run", ["mcap"], NOT_INSTALLED % ("mcap", "record")),
+    ],
+)
+def test_a_verb_names_the_package_or_the_extra_that_it_lacks(
+    tmp_path: Path, line: str, missing: list[str], complaint: str
+) -> None:
+    words = line.split() if line.startswith("fishd") else ["fishctl", *line.split()]
+    program = Path(FISHCTL).with_name(words[0])
+    done = call(program, *words[1:], env=environment_without(tmp_path, *missing))
     assert (done.returncode, done.stdout) == (1, "")
-    assert re.fullmatch(rf"fishctl: {module} is not installed; [^\n]*\[{extra}\]'\n", done.stderr)
+    assert re.fullmatch(complaint, done.stderr)

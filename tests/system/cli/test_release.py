@@ -3,7 +3,6 @@
 import datetime
 import os
 import re
-import signal
 import subprocess
 import time
 from collections.abc import Iterator
@@ -75,17 +74,6 @@ def test_a_file_of_the_service_that_is_not_there_is_exit_status_78() -> None:
     ended = release(FISHD_CONFIG="/nowhere/fishd.yaml")
     assert ended.returncode == 78
     assert "/nowhere/fishd.yaml: no such file" in ended.stderr
-
-
-def test_the_last_resort_works_while_a_fishd_hangs(pi: Bench) -> None:
-    with pi.daemon() as daemon:
-        daemon.fishctl("set-controller", "hold", "--angle", "0.2")
-        daemon.stop()
-        try:
-            ended = release(*pi.settings)
-        finally:
-            daemon.process.send_signal(signal.SIGCONT)
-    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def test_a_fishd_that_drives_the_servo_is_asked_for_an_emergency_stop(pi: Bench) -> None:
@@ -178,12 +166,3 @@ def test_a_pigpiod_that_does_not_answer_is_one_line_and_no_long_wait(pi: Bench, 
     assert time.monotonic() - began < 5.0
     assert (ended.returncode, ended.stdout) == (1, "")
     assert re.fullmatch(r"fishctl: pigpiod at 127.0.0.1:\d+: [^\n]+\n", ended.stderr)
-
-
-def test_without_a_pwm_chip_it_says_which_overlay_is_missing(tmp_path: Path) -> None:
-    ended = release(
-        *("--set", "robot=pi", "--set", "servo.driver=sysfs-pwm"),
-        *("--set", f"servo.root={tmp_path}", "--set", f"state_folder={tmp_path}"),
-    )
-    assert (ended.returncode, ended.stdout) == (1, "")
-    assert re.fullmatch(r"fishctl: [^\n]*overlay[^\n]*\n", ended.stderr)

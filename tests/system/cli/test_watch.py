@@ -12,7 +12,7 @@ import struct
 import subprocess
 import termios
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -22,28 +22,32 @@ from rich.screen import Screen
 from rigs.drawing_interrupted import ENTER_SCREEN, LEAVE_SCREEN, signal_as_drawing_begins
 from rigs.processes import FISHCTL, PATIENCE, Daemon, running, wait_until
 
+from fishd.cli.status import _reading_rows
 from fishd.cli.watch_screen import View
 from fishd.client import Fish
-from fishd.core.signals import LeaseHolder, Percentiles, Reason, Status, Tick, Timing
+from fishd.core.console import status_line
+from fishd.core.signals import (
+    LeaseHolder,
+    Percentiles,
+    ReadingState,
+    Reason,
+    Status,
+    Tick,
+    Timing,
+)
 
 HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
 COLOUR = re.compile(r"\x1b\[(?:\d+;)*[34]\d(?:;\d+)*m")
 BRAILLE = re.compile("[\u2801-\u28ff]")
 
 
-@pytest.fixture(scope="module")
-def daemon_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    with running(tmp_path_factory.mktemp("daemon")) as daemon:
-        yield daemon
-
-
 @pytest.fixture
-def daemon(daemon_of_all: Daemon) -> Daemon:
+def daemon(shared_daemon: Daemon) -> Daemon:
     """The fishd, swimming, reset to its state after the start."""
-    with Fish(daemon_of_all.at_rest().endpoint, timeout=PATIENCE) as fish:
+    with Fish(shared_daemon.at_rest().endpoint, timeout=PATIENCE) as fish:
         fish.set_controller("swing")
         wait_until(lambda: fish.status().phi_c != 0.0)
-    return daemon_of_all
+    return shared_daemon
 
 
 class Terminal:
@@ -127,8 +131,6 @@ def test_json_lines_are_not_held_back_and_ctrl_c_is_a_clean_end(daemon: Daemon) 
         stderr=subprocess.PIPE,
         text=True,
     ) as process:
-        assert process.stdout
-        assert process.stderr
         assert json.loads(process.stdout.readline())["mode"] == "running"
         process.send_signal(signal.SIGINT)
         process.stdout.read()
@@ -217,6 +219,7 @@ def status(**fields: Any) -> Status:
         **dict.fromkeys(Status.__struct_fields__, 0)
         | {"mode": "running", "reason": None, "controller": "swing", "parameters": {"C": 0.6}}
         | {"timing": timing, "tick": 0.05, "fallback": None, "force_unit": "N", "robot": "pi"}
+        | {"readings": {}}
         | fields
     )
 
@@ -247,6 +250,29 @@ def test_lost_ticks_are_counted_and_leave_a_gap_in_the_traces() -> None:
     gap = re.compile("[\u2801-\u28ff][ \u2800]{8,}[\u2801-\u28ff]")
     assert gap.search(still_trace(holed))
     assert not gap.search(still_trace(complete))
+
+
+def test_readings_are_in_the_screen_in_status_and_in_the_line_of_watch() -> None:
+    about = {"description": "", "low": None, "high": None}
+    readings = {
+        "power": ReadingState(
+            unit="W", sensor="meter", value=0.6712, age=0.01, problem=None, **about
+        ),
+        "flow": ReadingState(
+            unit="L/min", sensor="pump", value=1.5, age=3.2, problem=None, **about
+        ),
+        "depth": ReadingState(
+            unit="m", sensor="pump", value=None, age=None, problem="no depth", **about
+        ),
+    }
+    shown = status(readings=readings)
+    screen = "\n".join(render(view_of(map(tick, range(1, 101)), readings=readings)))
+    assert "power 671 mW   flow 1.5 L/min   depth –" in screen
+    assert "power   671 mW  flow 1.5 L/min  depth        –" in status_line(shown)
+    assert _reading_rows(shown) == [
+        ("meter", "power 671 mW"),
+        ("pump", "flow 1.5 L/min (3 s old), depth –"),
+    ]
 
 
 def test_it_shows_which_experiment_holds_the_fish() -> None:

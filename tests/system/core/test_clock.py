@@ -2,7 +2,7 @@
 
 import asyncio
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from itertools import islice, pairwise
 
 import pytest
@@ -15,10 +15,9 @@ PERIOD = 0.02
 async def slots(
     count: int,
     nap_before: Mapping[int, float] | None = None,
-    warm_up: Callable[[], None] | None = None,
 ) -> list[Slot]:
     """Return slots of a real ticker; `nap_before` holds the time that the body of a turn takes."""
-    ticker = Ticker(PERIOD, warm_up)
+    ticker = Ticker(PERIOD)
     collected: list[Slot] = []
     try:
         async for slot in ticker:
@@ -63,39 +62,3 @@ def test_the_asyncio_loop_is_served_between_ticks_even_under_overload() -> None:
         return served
 
     assert asyncio.run(run()) >= 4
-
-
-@pytest.mark.realtime
-def test_a_warm_up_comes_just_before_each_deadline_and_delays_no_tick() -> None:
-    warmed: list[float] = []
-    first = asyncio.run(slots(20, warm_up=lambda: warmed.append(time.monotonic())))[0]
-    assert len(warmed) >= 5
-    for moment in warmed:
-        to_go = (first.deadline - moment) % PERIOD
-        assert 0 < to_go < Ticker.MARGIN_S
-
-
-@pytest.mark.realtime
-def test_a_warm_up_for_which_there_is_no_time_is_left_out() -> None:
-    warmed: list[float] = []
-
-    def slow() -> None:
-        warmed.append(time.monotonic())
-        time.sleep(PERIOD)
-
-    asyncio.run(slots(20, warm_up=slow))
-    assert len(warmed) == 1
-
-
-@pytest.mark.realtime
-def test_one_warm_up_during_which_the_machine_stood_still_does_not_end_them() -> None:
-    warmed: list[float] = []
-
-    def stopped_once() -> None:
-        warmed.append(time.monotonic())
-        if len(warmed) == 3:
-            time.sleep(10 * PERIOD)
-
-    # The next warm-up may take a few ms on a busy machine, and leave out some more.
-    asyncio.run(slots(100, warm_up=stopped_once))
-    assert len(warmed) >= 8

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import UNSET
 from rigs.example_packages import (
     BUS,
     MILLIVOLTS_PER_NEWTON,
+    DepthRig,
     LoadCellRig,
     ServoBoardRig,
     fishctl,
@@ -367,6 +369,23 @@ def test_pca9685_a_fish_swims_on_it_beside_the_force_sensor_on_its_bus(tmp_path:
     assert sum(tick.fx for tick in ticks) / len(ticks) == pytest.approx(THRUST, rel=0.05)
 
 
+@pytest.mark.usefixtures("_installed")
+def test_keller_ld_its_readings_are_in_ticks_status_and_observations(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        rig = DepthRig(tmp_path, stack, "sensors.depth.kind=keller_ld")
+        rig.start("square", frequency=1.7)
+        ticks = rig.run_for(3.0)
+        expected = {"pressure": pytest.approx(101_325, abs=100), "water_temperature": 21.35}
+        assert ticks[-1].readings == pytest.approx(expected)
+        assert rig.loop.perception.observation.readings == ticks[-1].readings
+        assert rig.loop.readings.states(rig.clock.now)["pressure"].unit == "Pa"
+        rig.keller.plugged_in = False
+        assert {tick.readings for tick in rig.run_for(2.0)[-20:]} == {UNSET}
+        assert rig.mode == "running"
+        rig.keller.plugged_in = True
+        assert rig.run_for(2.0)[-1].readings == pytest.approx(expected)
+
+
 def test_doctor_names_both_with_their_checks_and_release_works(site: Path, tmp_path: Path) -> None:
     servo = ["robot=pi", "servo.driver=pca9685", f"servo.bus={BUS}"]
     checks = doctor(site, tmp_path, "force_sensor.driver=hx711", *servo)
@@ -381,6 +400,16 @@ def test_doctor_names_both_with_their_checks_and_release_works(site: Path, tmp_p
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith(f"fishctl: /dev/i2c-{BUS} does not exist")
     assert done.stderr.count("\n") == 1
+
+
+def test_doctor_says_what_a_sensor_of_another_package_reads_or_why_not(
+    site: Path, tmp_path: Path
+) -> None:
+    sensor = ["robot=pi", "sensors.depth.kind=keller_ld", f"sensors.depth.bus={BUS}"]
+    checks = doctor(site, tmp_path, *sensor)
+    assert "sensors.depth keller_ld of fishd-keller-ld 0.1.0" in checks["drivers"]["message"]
+    assert checks["depth"]["level"] == "FAIL"
+    assert f"/dev/i2c-{BUS} does not exist" in checks["depth"]["message"]
 
 
 def test_a_driver_whose_package_is_not_installed_is_one_line() -> None:

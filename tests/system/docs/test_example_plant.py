@@ -10,9 +10,9 @@ from rigs.processes import PATIENCE, running, sets, wait_until
 
 from fishd.client import Fish
 from fishd.config import load, to_yaml
-from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.lab.simulation import simulate
 from fishd.learning.env.fish_variation import episode_fish
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.settings import Randomisation
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.registry import open_plant

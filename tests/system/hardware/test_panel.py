@@ -61,10 +61,6 @@ def panel(chip: gpiochip.Pins, make: Make) -> Panel:
     return make(OPENS)
 
 
-def is_pulled_up(chip: gpiochip.Pins, pin: int) -> bool:
-    return chip.lines[pin].pull == gpiochip.PULL_UP
-
-
 def test_a_press_is_reported_at_once_by_another_thread(chip: gpiochip.Pins, panel: Panel) -> None:
     threads = []
     panel.on_press = lambda: threads.append(threading.current_thread())
@@ -112,13 +108,6 @@ def test_a_release_takes_two_polls(
     assert panel.update("estop", 0.20) is False
 
 
-def test_a_button_that_is_pressed_at_the_start_is_seen_by_the_first_tick(
-    chip: gpiochip.Pins, make: Make
-) -> None:
-    chip.set_level(BUTTON, OPEN)
-    assert make(OPENS).update("idle", 0.0) is True
-
-
 def test_a_spike_that_is_gone_when_looked_at_is_no_press(
     chip: gpiochip.Pins, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -154,25 +143,24 @@ def test_a_contact_that_chatters_without_end_is_a_press(chip: gpiochip.Pins, mak
         thread.join()
 
 
-def test_a_broken_wire_is_a_press_where_the_button_opens_a_contact(
-    chip: gpiochip.Pins, make: Make
+@pytest.mark.parametrize(
+    ("settings", "released", "pressed"),
+    [(OPENS, GROUND, OPEN), (CLOSES, OPEN, GROUND)],
+    ids=["opens, and a broken wire is a press", "closes"],
+)
+def test_a_button_is_pressed_when_its_contact(
+    chip: gpiochip.Pins,
+    make: Make,
+    settings: PanelSettings,
+    released: int | None,
+    pressed: int | None,
 ) -> None:
-    chip.set_level(BUTTON, GROUND)
-    panel = make(OPENS)
-    assert is_pulled_up(chip, BUTTON)
+    chip.set_level(BUTTON, released)
+    panel = make(settings)
+    assert chip.lines[BUTTON].pull == gpiochip.PULL_UP
     assert panel.update("idle", 0.0) is False
-    chip.set_level(BUTTON, OPEN)
+    chip.set_level(BUTTON, pressed)
     assert panel.update("idle", 0.05) is True
-
-
-def test_a_button_that_closes_a_contact_is_pressed_when_low(
-    chip: gpiochip.Pins, make: Make
-) -> None:
-    panel = make(CLOSES)
-    assert is_pulled_up(chip, BUTTON)
-    assert panel.update("running", 0.0) is False
-    chip.set_level(BUTTON, GROUND)
-    assert panel.update("running", 0.05) is True
 
 
 def record_light(

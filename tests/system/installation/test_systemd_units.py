@@ -110,17 +110,47 @@ def test_what_the_hardware_needs_stays_open() -> None:
     } <= open_
 
 
-@pytest.mark.parametrize("unit", ON_THE_ROBOT)
-def test_the_devices_of_the_robot_are_allowed_and_no_others(unit: str) -> None:
-    assert setting(unit, "DevicePolicy") == ["closed"]
-    devices = {line.split()[0] for line in setting(unit, "DeviceAllow")}
-    assert devices == {"char-i2c", "char-gpiochip", "char-*gpiomem*"}
-    assert setting(unit, "SupplementaryGroups") == ["i2c gpio"]
+ROBOT_DEVICES = ["char-i2c rw", "char-gpiochip rw", "char-*gpiomem* rw"]
+SETTINGS: list[tuple[str, dict[str, list[str]]]] = [
+    ("fishd.service", {"Restart": ["on-failure"], "RestartPreventExitStatus": ["78"]}),
+    # The other processes carry telemetry and requests, which fishd needs while it fades.
+    ("fishd.service", {"KillMode": ["mixed"], "LimitNOFILE": ["4096"]}),
+    ("fishd.service", {"DevicePolicy": ["closed"], "DeviceAllow": ROBOT_DEVICES}),
+    ("fishd-failure.service", {"DevicePolicy": ["closed"], "DeviceAllow": ROBOT_DEVICES}),
+    ("fishd.service", {"SupplementaryGroups": ["i2c gpio"], "User": ["fishd"]}),
+    ("fishd-failure.service", {"SupplementaryGroups": ["i2c gpio"]}),
+    ("fishd-recorder.service", {"PrivateDevices": ["yes"], "IOSchedulingClass": ["idle"]}),
+    ("fishd-recorder.service", {"Environment": ["FISHD_ENDPOINT=ipc:///run/fishd/control"]}),
+    ("fishd-recorder.service", {"User": ["fishd"]}),
+    ("fishd-camera.service", {"DevicePolicy": ["closed"], "DeviceAllow": ["char-video4linux rw"]}),
+    ("fishd-camera.service", {"SupplementaryGroups": ["video"], "User": ["fishd"]}),
+    ("fishd-camera.service", {"RestartPreventExitStatus": ["78"]}),
+]
+BOUNDS = [
+    ("fishd.service", "MemoryMax", 1, 300),
+    ("fishd.service", "TasksMax", 1, 64),
+    ("fishd-recorder.service", "Nice", 1, 19),
+    ("fishd-camera.service", "Nice", 1, 19),
+    # This also limits ExecStopPost=, which takes 3 s on an idle Zero 2 W.
+    ("fishd.service", "TimeoutStopSec", 20, 90),
+    ("fishd-failure.service", "TimeoutStartSec", 20, 90),
+]
+"""Unit, key, and the smallest and largest number it may have."""
 
 
-def test_a_wrong_config_is_not_tried_again() -> None:
-    assert setting("fishd.service", "Restart") == ["on-failure"]
-    assert setting("fishd.service", "RestartPreventExitStatus") == [str(os.EX_CONFIG)]
+@pytest.mark.parametrize(("unit", "values"), SETTINGS, ids=str)
+def test_a_unit_gives_way_to_fishd_and_reaches_its_own_devices_only(
+    unit: str, values: dict[str, list[str]]
+) -> None:
+    assert {key: setting(unit, key) for key in values} == values
+
+
+@pytest.mark.parametrize(("unit", "key", "low", "high"), BOUNDS)
+def test_a_unit_takes_no_more_than_a_pi_has_and_gets_the_time_that_it_needs(
+    unit: str, key: str, low: int, high: int
+) -> None:
+    (value,) = setting(unit, key)
+    assert low <= int(value.removesuffix("M")) <= high
 
 
 def test_the_servo_is_released_however_the_daemon_ends() -> None:
@@ -132,47 +162,6 @@ def test_the_servo_is_released_however_the_daemon_ends() -> None:
         line for line in setting("fishd-failure.service", "ExecStart") if "fishd-release" in line
     )
     assert last_resort == f"-{release}"
-
-
-@pytest.mark.parametrize(
-    ("unit", "limit"),
-    [("fishd.service", "TimeoutStopSec"), ("fishd-failure.service", "TimeoutStartSec")],
-)
-def test_a_release_on_a_slow_pi_has_the_time_that_it_takes(unit: str, limit: str) -> None:
-    """TimeoutStopSec= also limits ExecStopPost=, which takes 3 s on an idle Zero 2 W."""
-    assert float(setting(unit, limit)[0]) >= 20
-
-
-def test_clients_and_controllers_cannot_take_what_the_pi_needs() -> None:
-    (memory,) = setting("fishd.service", "MemoryMax")
-    assert int(memory.removesuffix("M")) <= 300
-    assert int(setting("fishd.service", "LimitNOFILE")[0]) == 4096
-    assert int(setting("fishd.service", "TasksMax")[0]) <= 64
-
-
-def test_only_fishd_itself_is_asked_to_stop() -> None:
-    """The other processes carry telemetry and requests, which fishd needs while it fades."""
-    assert setting("fishd.service", "KillMode") == ["mixed"]
-
-
-def test_the_black_box_gives_way_to_fishd_and_reaches_no_device() -> None:
-    unit = "fishd-recorder.service"
-    assert setting(unit, "PrivateDevices") == ["yes"]
-    assert int(setting(unit, "Nice")[0]) > 0
-    assert setting(unit, "IOSchedulingClass") == ["idle"]
-    (fishd,) = setting("fishd.service", "RuntimeDirectory")
-    assert setting(unit, "Environment") == [f"FISHD_ENDPOINT=ipc:///run/{fishd}/control"]
-    assert setting(unit, "User") == setting("fishd.service", "User")
-
-
-def test_the_camera_gives_way_to_fishd_and_reaches_video_devices_only() -> None:
-    unit = "fishd-camera.service"
-    assert setting(unit, "DevicePolicy") == ["closed"]
-    assert setting(unit, "DeviceAllow") == ["char-video4linux rw"]
-    assert setting(unit, "SupplementaryGroups") == ["video"]
-    assert int(setting(unit, "Nice")[0]) > 0
-    assert setting(unit, "User") == setting("fishd.service", "User")
-    assert setting(unit, "RestartPreventExitStatus") == [str(os.EX_CONFIG)]
 
 
 def test_the_daemon_and_the_unit_agree_on_real_time() -> None:

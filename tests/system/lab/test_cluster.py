@@ -43,7 +43,7 @@ def test_a_worker_of_one_thread_finds_what_this_machine_finds(
 ) -> None:
     words = ("sweep", "square", "--frequency", "1.5,2", *SHORT_SWIM, "--folder")
     there = fishctl(*words, str(tmp_path / "there"), "--cluster", cluster.address)
-    assert (there.returncode, there.stderr) == (0, "")
+    assert (there.returncode, there.stderr) == (0, ""), there.stderr
     assert fishctl(*words, str(tmp_path / "here"), "--jobs", "1").returncode == 0
     assert rows(tmp_path / "here") == rows(tmp_path / "there")
     with workers(tmp_path / "stop", cluster=str(cluster.file)) as crew:

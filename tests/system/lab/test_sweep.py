@@ -17,21 +17,17 @@ from fishd.core.errors import ConfigError, FishdError, RecordingError
 from fishd.core.signals import Tick
 from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.parallel import FileStop
+from fishd.lab.rerun import rerun
 from fishd.lab.session import Disturbed, VirtualSession
 from fishd.lab.sweep.curves import WholeTicks, find_best_of_whole_ticks, make_curves
 from fishd.lab.sweep.grid import MAX_POINTS, Lengths, Point
 from fishd.lab.sweep.measuring import Task, measure_all, simulate_point, swim
 from fishd.lab.sweep.results import Result, SweepFolder, select_quantity
 from fishd.recording import open_run
-from fishd.recording.rerun import rerun
 
 DRIFTS = ("simulation.noise=0.001", "simulation.drift=0.005", "simulation.offset_y=0.01")
 MEASURED = select_quantity("live", {}, "N").measured
 SQUARES = [Point("square", {"frequency": value}) for value in (1.25, 5.0 / 3.0, 2.0)]
-
-
-def do_nothing(*_: object) -> None:
-    pass
 
 
 def open_folder(
@@ -50,7 +46,7 @@ def open_folder(
 
 def measure(folder: SweepFolder, points: Sequence[Point], session: VirtualSession) -> None:
     with session:
-        measure_all(folder, points, session, 21.0, do_nothing)
+        list(measure_all(folder, points, session, 21.0))
 
 
 def test_a_simulated_fish_is_judged_by_its_true_thrust_whatever_its_sensor_says() -> None:
@@ -80,7 +76,7 @@ def test_a_rig_that_drifts_is_measured_point_by_point_and_recorded(tmp_path: Pat
     config = load(None, DRIFTS)
     folder = open_folder(tmp_path, config)
     with VirtualSession(config) as session:
-        measure_all(folder, SQUARES, session, 30.0, do_nothing)
+        list(measure_all(folder, SQUARES, session, 30.0))
     for point, truth in zip(SQUARES, (20.57e-3, 25.74e-3, 23.83e-3), strict=True):
         result = folder.results[folder.key(point)]
         assert result.thrust is not None
@@ -142,16 +138,6 @@ def test_a_table_with_other_columns_is_refused_with_what_differs(
     (tmp_path / "rows.csv").write_text(head + "\n")
     with pytest.raises(ConfigError, match=named):
         open_folder(tmp_path)
-
-
-def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
-    folder = open_folder(tmp_path)
-    for point in SQUARES:
-        folder.add_result(point, Result(thrust=0.02, thrust_ci95=1e-4), b"a recording")
-    table = tmp_path / "rows.csv"
-    table.write_bytes(table.read_bytes()[:-30])
-    assert len(open_folder(tmp_path).results) == 2
-    assert table.read_text().count("\n") == 3
 
 
 def test_a_table_as_long_as_that_of_as_many_points_as_are_permitted_is_resumed(

@@ -29,16 +29,12 @@ def pytest_ignore_collect(collection_path: Path) -> bool | None:
 
 
 @pytest.fixture(scope="module")
-def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    settings = sets("simulation.noise=0.001", "tick=0.05")
+def shared_daemon(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Daemon]:
+    settings = getattr(request.module, "DAEMON", sets("simulation.noise=0.001", "tick=0.05"))
     with running(tmp_path_factory.mktemp("daemon"), *settings) as process:
         yield process
-
-
-@pytest.fixture
-def daemon(shared_daemon: Daemon) -> Daemon:
-    """A fishd shared by the tests of a module, at rest at the start of each."""
-    return shared_daemon.at_rest()
 
 
 def trained_once(factory: pytest.TempPathFactory, name: str, **settings: Any) -> "Outcome":

@@ -1,6 +1,7 @@
 """`fishctl adapt`: the cloud of fish, the choice of the gait, and a resume without repeats."""
 
 import dataclasses
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -11,28 +12,19 @@ import pytest
 from rigs.processes import fishctl
 from rigs.virtual_daemon import VirtualDaemon
 
-from fishd.cli.adapt import format_command
-from fishd.cli.experiment_options import ChosenFish
+from fishd.cli.adapt import format_command, gait_words
+from fishd.cli.experiment import ChosenFish
 from fishd.client import Fish
 from fishd.config import Config, load
-from fishd.core.errors import ConfigError, FishdError, RecordingError, Refused
-from fishd.lab.experiment import Header, find_answer, open_experiment
+from fishd.core.errors import ConfigError, FishdError, Refused
+from fishd.lab.compare.comparison import Standing, Verdict
+from fishd.lab.experiment import Experiment, Header, open_experiment
 from fishd.lab.identification import Channel, Estimate, Fit, Identification, Unidentifiable
-from fishd.lab.ranking import format_ratio
-from fishd.lab.session import LiveSession, VirtualSession
-from fishd.learning.adapt import adaptation, report, steps
-from fishd.learning.adapt.adaptation import Adaptation
+from fishd.lab.session import LiveSession, Session, VirtualSession
+from fishd.lab.swim_log import SwimLog
+from fishd.learning.adapt import adaptation, steps
 from fishd.learning.adapt.prior import MODEL_ERROR, model_of
-from fishd.learning.adapt.state import (
-    TRAINING,
-    AdaptFolder,
-    Contender,
-    Fitted,
-    Model,
-    State,
-    Trained,
-    Tried,
-)
+from fishd.learning.adapt.results import TRAINING, Adapted, Fitted, Model, Trained, Wave
 from fishd.learning.adapt.steps import draw_cloud, train_policy
 from fishd.learning.adapt.verdict import judge
 from fishd.learning.env.fish_variation import draw_edge_fish, draw_fish
@@ -99,20 +91,65 @@ def test_draws_beyond_the_bounds_of_the_fit_are_rejected_and_few_may_be_left() -
     assert len(draw_cloud(hopeless, PHI)) < steps.MIN_CLOUD_SIZE
 
 
-def test_a_training_that_fails_is_left_out_and_loses_no_measurement(
+class StoringDisplay:
+    """A display that stores its lines."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def done(self, line: str, amount: float) -> None:
+        self.lines.append(line)
+
+    def at(self, amount: float, text: str | None = None) -> None:
+        pass
+
+    def warn(self, line: str) -> None:
+        self.lines.append(line)
+
+    def has(self, text: str) -> bool:
+        return any(text in line for line in self.lines)
+
+
+def open_folder(path: Path) -> AbstractContextManager[Experiment]:
+    header = Header(kind="adapt", on="live", settings={"seed": 0})
+    return open_experiment(path, header, resume=path.exists())
+
+
+def adapt(rig: Session, path: Path, show: StoringDisplay, seconds: float = 160.0) -> Adapted:
+    with open_folder(path) as experiment:
+        return adaptation.adapt(rig, experiment, seconds, 640, 0, show)
+
+
+@pytest.fixture
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out what takes long to compute: most fish, most fitted parameters, and a training."""
+    monkeypatch.setattr(steps, "train_policy", no_policy)
+    monkeypatch.setattr(steps, "draw_cloud", partial(draw_cloud, count=2))
+    monkeypatch.setattr(steps, "MIN_CLOUD_SIZE", 2)
+    monkeypatch.setattr(steps, "FITTED", FITTED_IN_BRIEF)
+
+
+def no_policy(*_: Any) -> Trained:
+    return Trained(steps=0, refusal="this test trains no policy")
+
+
+@pytest.mark.usefixtures("brief")
+def test_a_training_and_a_simulation_that_fail_are_left_out_and_lose_no_measurement(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_: Any) -> Trained:
+    def fail(*_: Any) -> Any:
         raise ValueError("low >= high")
 
-    monkeypatch.setattr(adaptation, "train_policy", fail)
-    run, show = folder(tmp_path / "run"), StoringDisplay()
-    run.state.fitted = fitted(GOOD)
+    monkeypatch.setattr(steps, "train_policy", fail)
+    monkeypatch.setattr(adaptation, "simulate_gaits", fail)
+    show = StoringDisplay()
     with VirtualSession(Config()) as rig:
-        Adaptation(rig, run, 150.0, 640, 0, show)._train(run.state)
-    trained = folder(run.path).state.trained
-    assert trained
-    assert trained.refusal == "its training failed: ValueError: low >= high"
+        adapted = adapt(rig, tmp_path / "run", show)
+    assert adapted.trained.refusal == "its training failed: ValueError: low >= high"
+    assert show.has("no policy takes part: its training failed: ValueError: low >= high")
+    assert show.has("a simulation of the identified fish failed: ValueError: low >= high")
+    assert {gait.contestant for gait in adapted.gaits} == {"swing", "square"}
+    assert adapted.expected_thrusts == {}
 
 
 def test_a_fit_that_fails_is_left_out_and_the_gaits_are_chosen_by_measurement(
@@ -122,31 +159,13 @@ def test_a_fit_that_fails_is_left_out_and_the_gaits_are_chosen_by_measurement(
         raise np.linalg.LinAlgError("SVD did not converge")
 
     monkeypatch.setattr(steps, "identify", fail)
-    run, show = folder(tmp_path / "run"), StoringDisplay()
+    show = StoringDisplay()
     with VirtualSession(Config()) as rig:
-        state = Adaptation(rig, run, 160.0, 640, 0, show).run()
-    assert any("the fit failed: LinAlgError: SVD did not converge" in line for line in show.lines)
-    assert {gait.name for gait in state.contenders} == {"swing", "square"}
-    assert state.verdict
-    _, page = report.write(run, PHI, "fishctl simulate")
-    assert "the fit failed: LinAlgError: SVD did not converge" in page.read_text(encoding="utf-8")
-
-
-def test_a_simulation_that_fails_loses_no_measurement(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: Any, **__: Any) -> None:
-        raise ValueError("low >= high")
-
-    monkeypatch.setattr(adaptation, "simulate", fail)
-    run, show = folder(tmp_path / "run"), StoringDisplay()
-    run.state.fitted = fitted(GOOD)
-    run.state.contenders = [contender("square", 0.02, 1e-4), contender("swing", 0.03, 1e-4)]
-    with VirtualSession(Config()) as rig:
-        Adaptation(rig, run, 160.0, 640, 0, show)._simulate(run.state)
-    assert [gait.expected_thrusts for gait in folder(run.path).state.contenders] == [[], []]
-    assert judge(run.state.contenders, GOOD).chosen_gait == "swing"
-    assert any("failed: ValueError: low >= high" in line for line in show.lines)
+        adapted = adapt(rig, tmp_path / "run", show)
+    assert show.has("the fit failed: LinAlgError: SVD did not converge")
+    assert show.has("no policy is trained: the fit is not used")
+    assert not (tmp_path / "run" / TRAINING).exists()
+    assert {gait.contestant for gait in adapted.gaits} == {"swing", "square"}
 
 
 def test_each_episode_of_a_training_swims_a_fish_of_the_cloud() -> None:
@@ -161,35 +180,33 @@ GOOD = Model(explained_fraction=0.995, standard_error=MODEL_ERROR)
 USELESS = Model(explained_fraction=0.61, standard_error=None)
 
 
-def contender(name: str, thrust: float, error: float, *expected: float) -> Contender:
-    return Contender(
-        name=name, controller=CONTROLLERS[name], parameters={}, thrust=thrust, thrust_ci95=error,
-        frequency=1.7, seconds=46.0, expected_thrusts=list(expected),
+def gait(name: str, thrust: float, error: float) -> Standing:
+    return Standing(
+        contestant=name, controller=CONTROLLERS[name], parameters={}, thrust=thrust,
+        thrust_ci95=error, frequency=1.7, fullness=1.0, form_factor=1.0, thrusts=[thrust],
     )  # fmt: skip
 
 
-def test_the_largest_thrust_wins_where_the_measurement_is_decisive() -> None:
-    won = judge([contender("swing", 21e-3, 0.2e-3), contender("square", 20e-3, 0.2e-3)], GOOD)
-    assert (won.chosen_gait, won.is_decided, won.undecided_gaits) == ("swing", True, ["swing"])
-    assert won.relative_thrust == pytest.approx(1.05)
-    # √2 · 1 % of relative error, for a single comparison
-    low, high = won.relative_thrust_ci95_low, won.relative_thrust_ci95_high
-    assert (low, high) == pytest.approx((1.0354, 1.0648), abs=5e-4)
-    assert "swing wins: its thrust is 105.0 %" in won.claim
+def decide(gaits: list[Standing], model: Model, **expected: tuple[float, ...]) -> Verdict:
+    return judge(gaits, model, expected)
+
+
+def test_the_verdict_is_that_of_a_comparison_where_the_measurement_is_decisive() -> None:
+    won = decide([gait("swing", 21e-3, 0.2e-3), gait("square", 20e-3, 0.2e-3)], GOOD)
+    assert won.best == ("swing",)
+    assert won.sentence.startswith("swing wins: it thrusts 105.0 % [103.6 %, 106.5 %] of square")
 
 
 def test_without_a_decisive_measurement_the_simplest_is_chosen_and_nothing_wins() -> None:
-    near = [contender("policy", 20.2e-3, 2e-4), contender("square", 20e-3, 2e-4)]
-    swing = contender("swing", 20.1e-3, 2e-4)
-    two, three = judge(near, GOOD), judge([swing, *near], USELESS)
-    assert (two.chosen_gait, two.is_decided, two.relative_thrust) == ("square", False, 1.0)
-    assert three.undecided_gaits == ["square", "swing", "policy"]
-    assert three.claim.startswith(
-        "undecided between the best square wave tried, swing and the policy; the best square "
-        "wave tried is chosen because it is the simplest. Thrusts relative to the best square "
+    near = [gait("policy", 20.2e-3, 2e-4), gait("square", 20e-3, 2e-4)]
+    swing = gait("swing", 20.1e-3, 2e-4)
+    two, three = decide(near, GOOD), decide([swing, *near], USELESS)
+    assert two.best[0] == "square"
+    assert three.best == ("square", "swing", "policy")
+    assert three.sentence == (
+        "undecided between square, swing and policy; square is chosen because it is the simplest; "
+        "the fit, which explains 61% of the forces, is not used for this"
     )
-    assert "The fit, which explains 61% of the forces, is not used for this" in three.claim
-    assert not any("wins" in verdict.claim for verdict in (two, three))
 
 
 @pytest.mark.parametrize(
@@ -203,40 +220,17 @@ def test_without_a_decisive_measurement_the_simplest_is_chosen_and_nothing_wins(
 )
 def test_the_identified_fish_has_weight_by_how_well_it_explains(model: Model, chosen: str) -> None:
     # Measured to 7 %; on the fish of the cloud the policy has 15 % more.
-    vague = [
-        contender("policy", 20.5e-3, 1.4e-3, 23e-3, 24e-3),
-        contender("square", 20e-3, 1.4e-3, 20e-3, 21e-3),
-    ]
-    verdict = judge(vague, model)
-    assert (verdict.chosen_gait, verdict.is_decided) == (chosen, False)
+    vague = [gait("policy", 20.5e-3, 1.4e-3), gait("square", 20e-3, 1.4e-3)]
+    verdict = decide(vague, model, policy=(23e-3, 24e-3), square=(20e-3, 21e-3))
+    assert (verdict.best[0], len(verdict.best)) == (chosen, 2)
     reason = "because the identified fish, which explains 99.5% of its forces, thrusts most with it"
-    assert (reason in verdict.claim) == (chosen == "policy")
+    assert (reason in verdict.sentence) == (chosen == "policy")
 
 
 def test_an_identified_fish_that_thrusts_contradict_is_not_used() -> None:
-    measured = [
-        contender("policy", 19.9e-3, 2e-4, 30e-3, 30e-3),
-        contender("square", 20e-3, 2e-4, 20e-3, 20e-3),
-    ]
-    assert judge(measured, GOOD).chosen_gait == "square"
-
-
-def test_intervals_of_two_are_wider_than_that_of_one() -> None:
-    square, swing = contender("square", 20e-3, 0.2e-3), contender("swing", 21e-3, 0.2e-3)
-    policy = contender("policy", 1e-3, 0.2e-3)
-    single, double = judge([swing, square], GOOD), judge([policy, swing, square], GOOD)
-    assert double.relative_thrust_ci95_high - double.relative_thrust_ci95_low == pytest.approx(
-        2.2414 / 1.96 * (single.relative_thrust_ci95_high - single.relative_thrust_ci95_low),
-        rel=2e-3,
-    )
-
-
-def test_a_square_wave_that_hardly_thrusts_is_no_reference_but_the_best_gait_is_named() -> None:
-    undecided = judge([contender("swing", 1e-4, 2e-4), contender("square", 1e-4, 2e-4)], GOOD)
-    assert (undecided.chosen_gait, undecided.relative_thrusts) == ("square", {})
-    assert undecided.claim.endswith("as the best square wave tried hardly thrusts")
-    won = judge([contender("swing", 5e-3, 2e-4), contender("square", 1e-4, 2e-4)], GOOD)
-    assert (won.chosen_gait, won.is_decided, won.relative_thrust) == ("swing", True, None)
+    measured = [gait("policy", 19.9e-3, 2e-4), gait("square", 20e-3, 2e-4)]
+    verdict = decide(measured, GOOD, policy=(30e-3, 30e-3), square=(20e-3, 20e-3))
+    assert verdict.best[0] == "square"
 
 
 @pytest.mark.parametrize(
@@ -303,7 +297,7 @@ def test_the_fit_decides_on_the_best_square_wave_if_it_explains_well(
     tried = []
     for frequency in search.ranges[0].values:
         thrust = scale(frequency) * square_wave(PlantParameters(), PHI, frequency).thrust
-        tried.append(Tried(frequency, thrust, 0.2e-3, 0, 0.0))
+        tried.append(Wave(frequency, thrust, 0.2e-3))
         search.observe({"frequency": frequency}, thrust, 0.2e-3)
     true = max(tried, key=lambda trial: trial.thrust).frequency
     frequency, is_used = steps.best_of(search, tried, fitted(model), PHI)
@@ -321,34 +315,8 @@ def test_with_a_good_fit_few_noisy_waves_do_not_move_the_maximum() -> None:
         thrust = luck * square_wave(PlantParameters(), PHI, frequency).thrust
         search.observe({"frequency": frequency}, thrust, 2e-3)
     forces = search.read_measurements("frequency")
-    tried = [Tried(*measurement, 0, 0.0) for measurement in zip(*forces, strict=True)]
+    tried = [Wave(*measurement) for measurement in zip(*forces, strict=True)]
     assert steps.best_of(search, tried, fitted(GOOD), PHI) == (pytest.approx(10 / 6), True)
-
-
-class StoringDisplay:
-    """A display that stores its lines."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def done(self, line: str, amount: float) -> None:
-        self.lines.append(line)
-
-    def at(self, amount: float, text: str = "") -> None:
-        pass
-
-    def warn(self, line: str) -> None:
-        self.lines.append(line)
-
-
-def no_policy(*_: Any) -> Trained:
-    return Trained(steps=0, refusal="this test trains no policy")
-
-
-def folder(path: Path) -> AdaptFolder:
-    header = Header(kind="adapt", on="live", settings={"seed": 0})
-    with open_experiment(path, header, resume=path.exists()) as experiment:
-        return AdaptFolder(experiment)
 
 
 class Stopped(BaseException):
@@ -356,71 +324,49 @@ class Stopped(BaseException):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("brief")
 def test_a_resume_repeats_no_measurement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(adaptation, "train_policy", no_policy)
-    # Each fish, and each fitted parameter, takes long to compute
-    monkeypatch.setattr(steps, "draw_cloud", partial(draw_cloud, count=2))
-    monkeypatch.setattr(steps, "MIN_CLOUD_SIZE", 2)
-    monkeypatch.setattr(steps, "FITTED", FITTED_IN_BRIEF)
-    path, config = tmp_path / "run", load("config/simulated.yaml")
-    daemon, show = VirtualDaemon(config), StoringDisplay()
+    path, daemon = tmp_path / "run", VirtualDaemon(load("config/simulated.yaml"))
+    fits: list[object] = []
+    identify = steps.identify
 
-    def adapt() -> State:
-        with LiveSession(cast(Fish, daemon)) as rig:
-            adapting = Adaptation(rig, folder(path), 160.0, 640, 0, show)
-            return adapting.run()
+    def count(*args: Any, **options: Any) -> Identification:
+        fits.append(args)
+        return identify(*args, **options)
+
+    def adapt_on_daemon() -> Adapted:
+        with (
+            LiveSession(cast(Fish, daemon)) as rig,
+            open_folder(path) as experiment,
+            rig.recorded(experiment.recording("adapt"), "") as writer,
+            rig.logged(SwimLog(experiment, writer, rig.tick).swim),
+        ):
+            gaits = [path / "gaits.png"]
+            return adaptation.adapt(rig, experiment, 160.0, 640, 0, StoringDisplay(), gaits)
 
     def stop(*_: Any, **__: Any) -> None:
         raise Stopped
 
     monkeypatch.setattr(LiveSession, "describe", lambda self, writer: None)
+    monkeypatch.setattr(steps, "identify", count)
     with monkeypatch.context() as broken:
         broken.setattr(steps, "search_square_waves", stop)
         with pytest.raises(Stopped):
-            adapt()
-    stored = folder(path).state
+            adapt_on_daemon()
     assert daemon.status().mode == "idle"
-    assert stored.excitation == "excitation.mcap"
-    assert stored.fitted
-    assert stored.swing
-    assert stored.tank_time == pytest.approx(0.34 * 160.0, abs=0.2)
-    state = adapt()
-    assert state.verdict
-    assert state.tank_time == pytest.approx(160.0, abs=0.2)
-    assert sum(line.startswith("excitation") for line in show.lines) == 1
-    assert any("this test trains no policy" in line for line in show.lines)
-    assert {gait.name for gait in state.contenders} == {"swing", "square"}
-    assert state.verdict.chosen_gait == "square"
-    assert state.verdict.undecided_gaits == ["square", "swing"]
-    assert all(len(gait.expected_thrusts) == 2 for gait in state.contenders)
-    for name, (value, low, high) in state.verdict.relative_thrusts.items():
-        assert 0.95 < value < 1.05, name
-        assert low < 1.0 < high
-    state.contenders[0] = msgspec.structs.replace(state.contenders[0], true_thrust=0.0257)
-    picture, page = report.write(folder(path), PHI, "fishctl set-controller <swing>")
-    assert picture.stat().st_size > 10_000
-    assert find_answer(path).summary == f"chosen: square --frequency {state.square:.6g}"
-    text = page.read_text(encoding="utf-8")
-    assert "fishctl set-controller &lt;swing&gt;" in text
-    assert "the best square wave tried, chosen" in text
-    in_the_tank = text.partition("<h2>In the tank</h2>")[2]
-    assert format_ratio(state.verdict.relative_thrusts["swing"]) in in_the_tank
-    assert "<td>rad/s</td>" in text
-    assert "<td>–</td>" in text
-    assert "e-" not in text.partition("<h2>The fish</h2>")[2]
-
-
-def test_no_policy_is_trained_on_a_fish_that_explains_too_little(tmp_path: Path) -> None:
-    run, show = folder(tmp_path / "run"), StoringDisplay()
-    run.state.fitted = fitted(USELESS)
-    with VirtualSession(Config()) as rig:
-        adapting = Adaptation(rig, run, 150.0, 640, 0, show)
-        adapting._train(run.state)
-    assert show.lines == ["no policy is trained: the fit is not used"]
-    stored = folder(run.path).state
-    assert stored.trained
-    assert stored.trained.refusal
-    assert not (run.path / TRAINING).exists()
+    swum = daemon.run.loop.seq
+    assert swum * 0.05 == pytest.approx(0.34 * 160.0, abs=0.2)
+    adapted = adapt_on_daemon()
+    assert len(fits) == 1
+    assert daemon.run.loop.seq * 0.05 == pytest.approx(160.0, abs=0.3)
+    assert adapted.tank_time == pytest.approx(160.0, abs=0.2)
+    assert adapt_on_daemon() == adapted
+    assert {gait.contestant for gait in adapted.gaits} == {"swing", "square"}
+    assert adapted.undecided == ("square", "swing")
+    assert all(len(thrusts) == 2 for thrusts in adapted.expected_thrusts.values())
+    for picture in ("fit.png", "search.png", "gaits.png"):
+        assert (path / picture).stat().st_size > 10_000
+    assert gait_words(adapted.chosen)[:2] == ["square", "--frequency"]
 
 
 def test_a_fish_that_is_only_noise_is_refused_in_one_line(
@@ -428,30 +374,11 @@ def test_a_fish_that_is_only_noise_is_refused_in_one_line(
 ) -> None:
     monkeypatch.setattr(steps, "FITTED", FITTED_IN_BRIEF)
     fish = ["plant.thrust_coefficient=1e-6", "plant.lateral_drag=1e-6", "simulation.noise=0.01"]
-    config = load(None, fish)
-    run = folder(tmp_path / "run")
     with (
-        VirtualSession(config) as rig,
+        VirtualSession(load(None, fish)) as rig,
         pytest.raises(Unidentifiable, match="neither F_x nor F_y follows φ_c"),
     ):
-        Adaptation(rig, run, 150.0, 640, 0, StoringDisplay()).run()
-    assert folder(run.path).state.excitation == "excitation.mcap"
-
-
-@pytest.mark.parametrize("content", [b"", bytes(999)], ids=["empty", "zeros"])
-def test_an_excitation_that_a_power_cut_has_emptied_is_swum_again(
-    tmp_path: Path, content: bytes
-) -> None:
-    run = folder(tmp_path / "run")
-    run.state.excitation = "excitation.mcap"
-    run.save()
-    (run.path / "excitation.mcap").write_bytes(content)
-    with (
-        VirtualSession(Config()) as rig,
-        pytest.raises(RecordingError, match=r"mcap is .*; if resumed, the fish swims it again"),
-    ):
-        Adaptation(rig, run, 150.0, 640, 0, StoringDisplay()).run()
-    assert folder(run.path).state.excitation is None
+        adapt(rig, tmp_path / "run", StoringDisplay(), 150.0)
 
 
 @pytest.mark.parametrize(
@@ -461,11 +388,11 @@ def test_an_excitation_that_a_power_cut_has_emptied_is_swum_again(
 def test_an_error_ends_an_adaptation_in_one_line_with_the_command_to_resume(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: FishdError, code: str, status: int
 ) -> None:
-    def run(_: Adaptation) -> State:
+    def fail(*_: Any) -> Adapted:
         raise error
 
     message = str(error)
-    monkeypatch.setattr(Adaptation, "run", run)
+    monkeypatch.setattr(adaptation, "adapt", fail)
     done = fishctl("adapt", "--folder", str(tmp_path / "run"))
     command = f"fishctl adapt --resume {tmp_path / 'run'}"
     assert done.stderr == f"fishctl: {message}; resume with: {command}{code}\n"
@@ -473,9 +400,7 @@ def test_an_error_ends_an_adaptation_in_one_line_with_the_command_to_resume(
 
 
 def test_the_last_line_is_the_command_to_type() -> None:
-    winner = msgspec.structs.replace(
-        contender("square", 1.0, 0.1), controller="square", parameters={"frequency": 5.0 / 3.0}
-    )
+    winner = msgspec.structs.replace(gait("square", 1.0, 0.1), parameters={"frequency": 5.0 / 3.0})
     live = ChosenFish("live", None, (), None)
     assert format_command(winner, live) == "fishctl set-controller square --frequency 1.66667"
     command = format_command(winner, live._replace(endpoint="ipc:///run/a"))

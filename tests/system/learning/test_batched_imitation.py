@@ -34,7 +34,6 @@ CHANGES = {
 def test_a_policy_of_a_batch_swims_the_simulated_fish(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run", **CHANGES)
     best = train(job).best
-    assert best
     policy = export(best, tmp_path / "policy.onnx").path
     assert [feature.name for feature in read(policy).card.observation] == list(SEEN)
     for omega0 in (10.5, 12.5, 15.0):

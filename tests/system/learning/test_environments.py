@@ -17,9 +17,8 @@ import fishd.learning  # noqa: F401 (registers the environments)
 from fishd.client import Fish
 from fishd.config import load
 from fishd.core.errors import ConfigError
-from fishd.lab.links.link import StepResult
-from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.env.environment import SwimEnv
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.settings import EnvironmentSettings
 
 STILL = ("simulation.noise=0.0",)
@@ -83,7 +82,6 @@ def test_an_environment_is_made_from_the_files_of_fish_and_training(tmp_path: Pa
     observation, _ = env.reset(seed=1)
     assert observation.shape == (1,)
     swim = env.unwrapped
-    assert isinstance(swim, SwimEnv)
     assert swim.link.amplitude == 0.2
     ends = [env.step(np.ones(1, np.float32))[2:4] for _ in range(3)]
     assert ends == [(False, False), (False, False), (False, True)]
@@ -276,22 +274,30 @@ def test_power_with_a_price_is_subtracted_from_the_reward() -> None:
         env = SwimEnv(link, config, settings)
         env.reset(seed=1)
         rewards.append(env.step(np.array([1.0], np.float32))[1])
-        power = link.step(0.42).power
-        assert power is not None
-        assert power > 0.06
+        assert link.step(0.42).observation.readings["power"] > 0.06
     assert rewards[1] < rewards[0] - 0.3 * 0.01 * 0.06 / env.best_thrust
-
-
-class Unmetered(SimulatedLink):
-    """A fish whose power is not known."""
-
-    def step(self, angle: float) -> StepResult:
-        return super().step(angle)._replace(power=None)
 
 
 def test_power_that_is_not_known_can_have_no_price() -> None:
     config = load(None)
-    env = SwimEnv(Unmetered(config), config, EnvironmentSettings(power_price=0.01, longest_start=0))
+    env = SwimEnv(
+        SimulatedLink(config, metered=False),
+        config,
+        EnvironmentSettings(power_price=0.01, longest_start=0),
+    )
     env.reset(seed=1)
-    with pytest.raises(ConfigError, match=r"environment\.power_price: the power of the servo"):
+    with pytest.raises(ConfigError, match=r"power_price: this fish has no reading power"):
         env.step(np.array([1.0], np.float32))
+
+
+def test_readings_are_inputs_of_an_agent_and_those_that_a_fish_lacks_are_refused() -> None:
+    water = "sensors.water={kind: simulated, value: 15, amplitude: 0, low: 10, high: 30}"
+    config = load(None, [water])
+    settings = EnvironmentSettings(observation=("fy",), readings=("water_temperature",))
+    env = SwimEnv(SimulatedLink(config, metered=False), config, settings)
+    env.reset(seed=1)
+    seen, *_ = env.step(np.array([1.0], np.float32))
+    assert seen.shape == (2,)
+    assert seen[1] == pytest.approx(-0.5)
+    with pytest.raises(ConfigError, match="the fish has no reading water_temperature; it has powe"):
+        SwimEnv(SimulatedLink(load(None)), load(None), settings)

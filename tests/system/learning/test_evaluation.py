@@ -64,7 +64,6 @@ def test_robot_and_start_of_the_configuration_are_ignored() -> None:
 def test_an_answer_that_is_not_a_number_is_a_fault() -> None:
     report = judge(CONFIG, lambda *_: math.nan, 5.0, 1.0)
     assert report.mode == "fault"
-    assert report.reason
     assert report.reason.code == "controller-error"
 
 
@@ -133,7 +132,6 @@ def test_training_keeps_the_policy_that_does_best_on_its_worst_fish(tmp_path: Pa
     assert all(
         float(row["lowest_relative_thrust"]) <= float(row["relative_thrust"]) for row in rows
     )
-    assert outcome.best_evaluation
     swimming = [float(row["lowest_relative_thrust"]) for row in rows if row["is_stalled"] == "0"]
     assert outcome.best_evaluation.lowest_relative_thrust == max(swimming)
     answer = find_answer(outcome.folder)

@@ -21,11 +21,11 @@ from fishd.controllers.policy.runtime import Network, Pilot
 from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import PolicyError
 from fishd.lab.compare import compare
-from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning import export as exporting
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.export import export, export_model
 from fishd.learning.extractors import random_angles
+from fishd.learning.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.look import look
 from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
 from fishd.learning.settings import (
@@ -122,7 +122,6 @@ def test_another_eye_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     def without_mean(*arguments: Any) -> Any:
         sight = make_sight(*arguments)
-        assert sight
         constants = dict(sight.constants)
         constants["mean"] = 0.0 * constants["mean"]
         return sight._replace(constants=constants)
@@ -144,8 +143,6 @@ def test_a_model_of_the_user_that_sees_pictures_is_refused(tmp_path: Path) -> No
 
 @pytest.mark.slow
 def test_an_exported_policy_swims_by_sight(tmp_path: Path, by_sight: Outcome) -> None:
-    assert by_sight.best
-    assert by_sight.best_evaluation
     exported = export(by_sight.best, tmp_path / "eye.onnx")
     past = exported.card.provenance
     assert past.relative_thrust == pytest.approx(by_sight.best_evaluation.relative_thrust)
@@ -156,7 +153,6 @@ def test_an_exported_policy_swims_by_sight(tmp_path: Path, by_sight: Outcome) ->
 
 @pytest.mark.slow
 def test_a_policy_by_sight_looks_where_the_tail_moves(tmp_path: Path, by_sight: Outcome) -> None:
-    assert by_sight.best
     path = export(by_sight.best, tmp_path / "eye.onnx").path
     sensitivity = look(str(path), Config(), DEFAULT, 10.0)  # with the camera of its training
     assert sensitivity.share > 2.0 * sensitivity.area

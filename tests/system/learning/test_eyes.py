@@ -13,10 +13,10 @@ from fishd.camera.axis import NoMotion
 from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.camera_frames import Stack, StackSettings
-from fishd.lab.links.link import StepResult
-from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.extractors import FeatureExtractor, make_extractor, random_angles
+from fishd.learning.links.link import StepResult
+from fishd.learning.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.settings import EnvironmentSettings, TrainingSettings, VisionSettings
 
 CONFIG = Config()
@@ -26,9 +26,7 @@ TICKS = 256
 
 def extractor_of(kind: str, **settings: object) -> FeatureExtractor:
     camera = VisionSettings(feature_extractor=kind, **settings)
-    extractor = make_extractor(TrainingSettings(see="camera", camera=camera))
-    assert extractor
-    return extractor
+    return make_extractor(TrainingSettings(see="camera", camera=camera))
 
 
 def swim_with(
@@ -45,7 +43,6 @@ def swim_with(
     stacks, fins = [], []
     for angle in angles:
         env.advance(float(angle))
-        assert env.stack
         stacks.append(env.stack)
         fins.append(link._swimming().loop.robot.truth().alpha)
     return stacks, np.array(fins), angles

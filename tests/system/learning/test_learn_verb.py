@@ -19,8 +19,8 @@ from fishd.cli.learn.ppo import print_outcome
 from fishd.cli.main import fishctl as commands
 from fishd.client import Fish
 from fishd.config import load
-from fishd.lab.links import fishd_link
 from fishd.learning.env.evaluation import Evaluation
+from fishd.learning.links import fishd_link
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.train.jobs import Outcome
 

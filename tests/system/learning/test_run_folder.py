@@ -158,7 +158,6 @@ def test_after_a_kill_at_any_call_of_a_save_the_best_is_the_new_or_the_old_one(
         ended = ends_before(call, partial(save_best, run, after))
         checkpoints.remove_partial(run)
         best = checkpoints.best(run)
-        assert best
         state = checkpoints.read_state(best)
         assert (state.steps, state.tank_time) in ((64, 1.0), (steps, 9.0))
         assert checkpoints.load_policy(best)

@@ -16,7 +16,7 @@ import pytest
 from joblib.externals.loky import get_reusable_executor
 from msgspec.structs import replace
 from rigs.dask_cluster import dask_cluster
-from rigs.processes import FISHCTL, fishctl, is_stopped, one_line
+from rigs.processes import FISHCTL, fishctl, is_stopped
 from rigs.swimming import LONG_ENOUGH, Done, brief_job, wait_for, while_it_trains
 
 from fishd.lab.parallel import FileStop
@@ -301,11 +301,3 @@ def test_a_summary_repeats_the_last_figures_of_a_seed_that_ended_early(tmp_path:
 def test_a_summary_of_seeds_without_evaluations_is_a_head(tmp_path: Path) -> None:
     write_summary(tmp_path / "seeds.csv", [tmp_path / "seed-0"])
     assert (tmp_path / "seeds.csv").read_text() == ",".join(SUMMARY) + "\n"
-
-
-def test_without_torch_no_training_begins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fishd.cli.learn.ppo.find_spec", lambda name: None)
-    done = fishctl(*command(tmp_path, "--seeds", "2"))
-    assert (done.returncode, done.stdout) == (1, "")
-    assert "torch is not installed" in one_line(done)
-    assert not (tmp_path / "run").exists()

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from rigs.swimming import BRIEF, brief_job
 
 from fishd.config import load
-from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.ppo import Rollout
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.settings import EnvironmentSettings, Randomisation
 from fishd.learning.thrust_signal import ThrustSignal
 from fishd.learning.train.progress import Display
@@ -88,8 +87,6 @@ def test_the_limit_of_a_spike_does_not_depend_on_the_scale_of_the_reward(tmp_pat
         training = Training(job, SimulatedLink(job.config), Display(), lambda: False)
         training._recorder.close()
         rollout = training._model.rollout_buffer
-        assert isinstance(rollout, Rollout)
-        assert rollout.signal
         fx = np.linspace(-0.001, 0.001, 64)
         fx[20] = 1.0
         largest.append(rollout.signal.estimate(fx, np.zeros(64)).max())
@@ -102,7 +99,6 @@ def test_the_errors_are_removed_unless_each_episode_has_another_fish(tmp_path: P
         training = Training(job, SimulatedLink(job.config), Display(), lambda: False)
         training._recorder.close()
         rollout = training._model.rollout_buffer
-        assert isinstance(rollout, Rollout)
         return rollout.signal
 
     assert signal("default")
@@ -117,5 +113,4 @@ def test_a_policy_learns_to_swim_a_rig_whose_sensor_is_turned_and_drifts(tmp_pat
     often = replace(settings.evaluation, every=6)
     job = replace(job, config=load(None, rig), settings=replace(settings, evaluation=often))
     best = train(job).best_evaluation
-    assert best
     assert best.relative_thrust > 0.95

@@ -36,7 +36,12 @@ async def test_a_viewer_gets_the_ticks_to_which_it_subscribes(window: WindowProc
         channels = {c["topic"]: c for c in (await read_text(sock))["channels"]}
         assert set(channels) == set(CHANNELS)
         tick = channels["tick"]
-        assert json.loads(tick["schema"])["properties"]["fx"]["type"] == "number"
+        properties = json.loads(tick["schema"])["properties"]
+        assert properties["fx"]["type"] == "number"
+        assert properties["readings"]["properties"]["power"] == {
+            "type": "number",
+            "description": "Electrical power that the servo takes from its supply. [W]",
+        }
         request = {"op": "subscribe", "subscriptions": [{"id": 7, "channelId": tick["id"]}]}
         await sock.send_str(json.dumps(request))
         seqs = []

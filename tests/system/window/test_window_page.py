@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import re
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -38,8 +39,8 @@ globalThis.feed = (count, drawn) => {
       mode: "running", controller: "swing", servo_on: true, samples: 2,
       fx: Math.sin(phase), fy: Math.cos(phase), fy_rate: 0, fin_velocity: phase % 1, phi_c: 0.4,
       thrust: 0.02, thrust_ci95: 0.001, frequency: 1.7, sample_age_ms: 2, lateness_us: 50,
-      busy_time_us: 90, missed_slots: 0, alpha: 0.1, phi: 0.3, power: 0.6,
-      quantities: { top_speed: phase % 2 },
+      busy_time_us: 90, missed_slots: 0, alpha: 0.1, phi: 0.3,
+      readings: { power: 0.6 }, quantities: { top_speed: phase % 2 },
     }]);
     if (i % drawn === 0) app.charts.draw(performance.now() + 1e7 + i * 100);
   }
@@ -120,6 +121,8 @@ def test_a_chart_moves_and_nothing_leaves_this_machine(window: WindowProcess) ->
         before = page.evaluate(pixels)
         wait_until(lambda: page.evaluate(pixels) != before)
         expect(page.locator("#cards")).to_contain_text("swing")
+        expect(page.locator("#cards")).to_contain_text(re.compile(r"Power.*W.*mean of 2 s"))
+        expect(page.get_by_text("power [W]")).to_be_visible()  # the title of its chart
         assert complaints == []
 
 

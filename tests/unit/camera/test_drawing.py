@@ -39,7 +39,6 @@ def test_a_file_shows_the_same_colours(tmp_path: Path) -> None:
     red[:, :, 0] = 255
     drawing.write_png(tmp_path / "red.png", drawing.enlarge(red))
     image = cv2.imread(str(tmp_path / "red.png"))
-    assert image is not None
     assert image.shape == (640, 640, 3)
     assert (image == [0, 0, 255]).all()
 

@@ -20,28 +20,24 @@ def levels_at(history: FrameHistory, tick: float) -> list[int] | None:
     return None if stack is None else [int(frame[0, 0]) for frame in stack]
 
 
-def test_a_tick_is_shown_the_newest_frame_at_or_before_each_of_its_times() -> None:
-    history = history_of(0.0, 0.03, 0.06, 0.1, 0.13, 0.16, 0.2)
-    assert levels_at(history, 0.2) == [6, 4, 3, 1]
-
-
-def test_times_that_differ_by_rounding_alone_are_equal() -> None:
-    history = history_of(*(k * 0.05 + 1e-9 for k in range(5)))
-    assert levels_at(history, 0.2) == [4, 3, 2, 1]
-
-
-def test_a_slow_camera_is_shown_twice_rather_than_not_at_all() -> None:
-    assert levels_at(history_of(0.0, 0.1, 0.2), 0.2) == [2, 1, 1, 0]
-
-
-def test_a_frame_that_has_not_arrived_yet_is_not_shown() -> None:
-    history = history_of(0.0, 0.05, 0.1, 0.15, 0.2, late=0.03)
-    assert levels_at(history, 0.2) == [3, 3, 2, 1]
-
-
-def test_with_a_delay_frames_of_a_late_camera_are_evenly_spaced() -> None:
-    history = history_of(*(k * 0.025 for k in range(13)), late=0.04, delay=0.05)
-    assert levels_at(history, 0.3) == [10, 8, 6, 4]
+@pytest.mark.parametrize(
+    ("history", "tick", "levels"),
+    [
+        (history_of(0.0, 0.03, 0.06, 0.1, 0.13, 0.16, 0.2), 0.2, [6, 4, 3, 1]),
+        (history_of(*(k * 0.05 + 1e-9 for k in range(5))), 0.2, [4, 3, 2, 1]),
+        (history_of(0.0, 0.1, 0.2), 0.2, [2, 1, 1, 0]),
+        (history_of(0.0, 0.05, 0.1, 0.15, 0.2, late=0.03), 0.2, [3, 3, 2, 1]),
+        (history_of(*(k * 0.025 for k in range(13)), late=0.04, delay=0.05), 0.3, [10, 8, 6, 4]),
+    ],
+    ids=[
+        "a fast camera", "times that differ by rounding alone", "a slow camera, shown twice",
+        "a frame that has not arrived yet", "a late camera and a delay, evenly spaced",
+    ],
+)  # fmt: skip
+def test_a_tick_is_shown_the_newest_frame_at_or_before_each_of_its_times(
+    history: FrameHistory, tick: float, levels: list[int]
+) -> None:
+    assert levels_at(history, tick) == levels
 
 
 @pytest.mark.parametrize("missing", [0, 1, 2, 3])

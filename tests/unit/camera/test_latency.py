@@ -76,13 +76,16 @@ def test_frames_of_another_swim_are_refused() -> None:
         find_latency(mixed, felt(swum(40.0)))
 
 
-def test_a_short_swim_is_refused() -> None:
-    ticks = swum(5.0)
-    with pytest.raises(NoDelay, match="10 s of swimming are needed"):
-        find_latency(filmed(ticks, DEFAULT), felt(ticks))
-
-
-def test_a_camera_that_sends_few_frames_is_refused() -> None:
-    ticks = swum(20.0)
-    with pytest.raises(NoDelay, match="19 frames are too few"):
-        find_latency(filmed(ticks, replace(DEFAULT, rate=1.0)), felt(ticks))
+@pytest.mark.parametrize(
+    ("seconds", "camera", "complaint"),
+    [
+        (5.0, DEFAULT, "10 s of swimming are needed"),
+        (20.0, replace(DEFAULT, rate=1.0), "19 frames are too few"),
+    ],
+)
+def test_a_short_swim_or_few_frames_are_refused(
+    seconds: float, camera: SimulatedCameraSettings, complaint: str
+) -> None:
+    ticks = swum(seconds)
+    with pytest.raises(NoDelay, match=complaint):
+        find_latency(filmed(ticks, camera), felt(ticks))

@@ -8,23 +8,21 @@ from msgspec.structs import replace
 
 from fishd.camera import messages
 from fishd.camera.messages import BadMessage, FrameHeader, PublishedFrame, Until
+from fishd.core.camera_frames import Pixels
 
 PIXELS = np.arange(12, dtype=np.uint8).reshape(3, 4)
 HEADER = FrameHeader(session="s", seq=7, time=1.25, available=1.5, width=4, height=3)
 
 
-def test_a_frame_is_read_back_as_it_was_sent() -> None:
-    message = messages.decode(messages.encode_frame(HEADER, PIXELS))
-    assert isinstance(message, PublishedFrame)
+@pytest.mark.parametrize(
+    "pixels",
+    [PIXELS, np.arange(48, dtype=np.uint8).reshape(6, 8)[::2, ::2]],
+    ids=["a frame", "a part of a larger picture"],
+)
+def test_it_is_read_back_as_it_was_sent(pixels: Pixels) -> None:
+    message = messages.decode(messages.encode_frame(HEADER, pixels))
     assert message.header == HEADER
-    assert np.array_equal(message.pixels, PIXELS)
-
-
-def test_a_part_of_a_larger_picture_is_sent_as_what_it_shows() -> None:
-    whole = np.arange(48, dtype=np.uint8).reshape(6, 8)
-    message = messages.decode(messages.encode_frame(HEADER, whole[::2, ::2]))
-    assert isinstance(message, PublishedFrame)
-    assert np.array_equal(message.pixels, whole[::2, ::2])
+    assert np.array_equal(message.pixels, pixels)
 
 
 def test_no_topic_begins_like_another() -> None:

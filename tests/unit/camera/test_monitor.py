@@ -1,6 +1,7 @@
 """Rate of a camera and age of its frames in its state."""
 
 import time
+from typing import Any
 
 import pytest
 
@@ -26,33 +27,25 @@ def streaming(clock: Clock, *, apart: float = 0.04, virtual: bool = False) -> Mo
     return monitor
 
 
-def test_rate_and_latency_are_those_of_late() -> None:
-    state = streaming(Clock()).state()
-    assert state.rate == pytest.approx(25.0)
-    assert state.latency == pytest.approx(0.03)
-
-
-def test_where_no_frame_has_come_for_a_while_there_is_neither_rate_nor_latency() -> None:
+@pytest.mark.parametrize(
+    ("options", "silence", "rate", "latency"),
+    [
+        ({}, 0.0, 25.0, 0.03),
+        ({}, 2.1, 0.0, None),
+        ({"apart": 4.0}, 5.0, 0.25, 0.03),
+        ({"apart": 4.0}, 13.0, 0.0, None),
+        ({"virtual": True}, 60.0, 25.0, 0.03),
+    ],
+    ids=["now", "a silence", "a slow camera", "frames of it are late", "in lockstep time stands"],
+)
+def test_rate_and_latency_are_those_of_late(
+    options: dict[str, Any], silence: float, rate: float, latency: float | None
+) -> None:
     clock = Clock()
-    monitor = streaming(clock)
-    clock.now += 2.1
-    assert (monitor.state().rate, monitor.state().latency) == (0.0, None)
-
-
-def test_the_rate_of_a_slow_camera_lasts_until_frames_are_late() -> None:
-    clock = Clock()
-    monitor = streaming(clock, apart=4.0)
-    clock.now += 5.0
-    assert monitor.state().rate == pytest.approx(0.25)
-    clock.now += 8.0
-    assert monitor.state().rate == 0.0
-
-
-def test_in_lockstep_nothing_grows_old_while_time_stands_still() -> None:
-    clock = Clock()
-    monitor = streaming(clock, virtual=True)
-    clock.now += 60.0
-    assert monitor.state().rate == pytest.approx(25.0)
+    monitor = streaming(clock, **options)
+    clock.now += silence
+    state = monitor.state()
+    assert (state.rate, state.latency) == pytest.approx((rate, latency))
 
 
 def test_the_age_of_a_condition_does_not_follow_the_unix_clock(

@@ -52,7 +52,6 @@ def measured(
 
 def test_a_good_adc_follows_the_duty_of_the_pulses() -> None:
     good = measured()
-    assert isinstance(good, Filter)
     assert good.high_level == pytest.approx(3.3, abs=0.005)
     assert abs(good.offset) < 1e-3
     assert good.time_constant == pytest.approx((0.1, 0.1), abs=FRAME)
@@ -62,7 +61,6 @@ def test_a_good_adc_follows_the_duty_of_the_pulses() -> None:
 @pytest.mark.parametrize("stalls", [(0.3, 0.0), (0.0, 0.3), (2.0, 0.0), (0.0, 2.0)])
 def test_a_stall_during_the_rise_is_not_blamed_on_the_filter(stalls: tuple[float, float]) -> None:
     good = measured(stalls=stalls)
-    assert isinstance(good, Filter)
     low, high = good.time_constant
     assert low < 0.1 < high
     assert analog.judge_filter(good).level == "ok"

@@ -79,7 +79,6 @@ def numeric_options(
         context = click.Context(command)
         for verb in command.list_commands(context):
             subcommand = command.get_command(context, verb)
-            assert subcommand
             yield from numeric_options(subcommand, f"{name} {verb}")
     for parameter in command.params:
         if isinstance(parameter.type, click.FloatRange):
@@ -124,10 +123,8 @@ def test_all_verbs_have_one_vocabulary() -> None:
             for name in METAVARS.keys() & set(parameter.opts):
                 assert parameter.metavar in METAVARS[name], (verb, name)
             if "--seed" in parameter.opts:
-                assert isinstance(parameter, click.Option)
                 assert (parameter.help or "").startswith("Seed of the random number generator of")
             if "--on" in parameter.opts:
-                assert isinstance(parameter.type, click.Choice)
                 assert list(parameter.type.choices) == ["live", "simulation"]
     for verb in EXPERIMENTS:
         shared = {"--on", "--config", "--endpoint", "--take", "--folder"}

@@ -24,29 +24,25 @@ def test_a_message_on_a_training_names_its_file(verb: tuple[str, ...], override:
 
 
 @pytest.mark.parametrize("verb", [("learn", "look"), ("compare",), ("policies", "show")])
-@pytest.mark.parametrize("inner", ["", "/step-256"])
-def test_a_run_folder_in_place_of_a_policy_is_to_be_exported_first(
-    tmp_path: Path, verb: tuple[str, ...], inner: str
+@pytest.mark.parametrize(
+    ("given", "complaint"),
+    [
+        ("{run}", "{run}: is the folder of a training, not a policy file; export it first: "),
+        ("{run}/step-256", "{run}/step-256: is the folder of a training, not a policy file; exp"),
+        ("{run}/step-256/model.zip", "model.zip: is part of a training, not a policy file; export"),
+    ],
+    ids=["a run", "its checkpoint", "the model of that"],
+)
+def test_a_run_in_place_of_a_policy_is_to_be_exported_first(
+    tmp_path: Path, verb: tuple[str, ...], given: str, complaint: str
 ) -> None:
     (tmp_path / "step-256").mkdir()
     (tmp_path / "settings.yaml").touch()
-    line = one_line(fishctl(*verb, f"{tmp_path}{inner}"))
-    assert line.endswith(
-        f"{tmp_path}{inner}: is the folder of a training, not a policy file; export it first: "
-        f"fishctl learn export {tmp_path}{inner}\n"
-    )
-
-
-def test_the_model_of_a_checkpoint_in_place_of_a_policy_is_to_be_exported_first(
-    tmp_path: Path,
-) -> None:
-    (tmp_path / "best-256").mkdir()
-    (tmp_path / "settings.yaml").touch()
-    (tmp_path / "best-256" / "model.zip").write_bytes(b"PK")
-    assert one_line(fishctl("compare", f"{tmp_path}/best-256/model.zip")).endswith(
-        f"{tmp_path}/best-256/model.zip: is part of a training, not a policy file; export it "
-        f"first: fishctl learn export {tmp_path}/best-256\n"
-    )
+    (tmp_path / "step-256" / "model.zip").write_bytes(b"PK")
+    policy = given.format(run=tmp_path)
+    line = one_line(fishctl(*verb, policy))
+    assert complaint.format(run=tmp_path) in line
+    assert line.endswith(f"fishctl learn export {policy.removesuffix('/model.zip')}\n")
 
 
 def test_the_name_of_a_run_folder_is_known_without_a_slash_too(

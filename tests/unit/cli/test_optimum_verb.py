@@ -53,25 +53,23 @@ def test_a_figure_that_cannot_be_written_is_refused_before_anything_is_computed(
     assert complaint in str(done.exception)
 
 
-def test_without_control_there_is_nothing_to_draw(tmp_path: Path) -> None:
-    done = invoke("--plot", str(tmp_path / "best.png"))
-    assert done.exit_code == 2
-    assert "give both" in done.output
-
-
 def test_ignored_parameters_are_reported() -> None:
     done = invoke("--set", "plant.backlash=0.02")
     assert "the limits leave out plant.backlash" in done.stderr
 
 
-def test_optimal_control_is_for_one_amplitude_at_a_time() -> None:
-    done = invoke("--any-shape", "--amplitude", "0.2", "--amplitude", "0.3")
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ("--plot best.png", "give both"),
+        ("--any-shape --amplitude 0.2 --amplitude 0.3", "one --amplitude at a time"),
+        *(
+            (f"--amplitude {value}", "a number in (0, 1.57] is needed")
+            for value in ("0", "-0.1", "1.6", "nan", "inf")
+        ),
+    ],
+)
+def test_what_has_no_sense_is_refused(line: str, complaint: str) -> None:
+    done = invoke(*line.split())
     assert done.exit_code == 2
-    assert "one --amplitude at a time" in done.output
-
-
-@pytest.mark.parametrize("value", ["0", "-0.1", "1.6", "nan", "inf"])
-def test_an_amplitude_that_no_fish_has_is_refused(value: str) -> None:
-    done = invoke("--amplitude", value)
-    assert done.exit_code == 2
-    assert "a number in (0, 1.57] is needed" in done.output
+    assert complaint in done.output

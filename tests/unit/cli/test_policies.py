@@ -121,9 +121,7 @@ def test_the_option_for_a_policy_completes_names_and_files(policy_folder: Path) 
     assert "--policy NAME|FILE" in shown
     assert "required" in shown
     verb = fishctl.get_command(click.Context(fishctl), "set-controller")
-    assert isinstance(verb, click.Group)
     ppo = verb.get_command(click.Context(verb), "ppo")
-    assert ppo
     option = next(param for param in ppo.params if "--policy" in param.opts)
     items = option.shell_complete(click.Context(ppo), "fl")
     assert [(item.value, item.type) for item in items] == [

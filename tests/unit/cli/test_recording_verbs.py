@@ -12,8 +12,8 @@ from rigs.harness import Rig
 from rigs.processes import fishctl, one_line
 from rigs.recordings import record_run, swum
 
+from fishd.core.camera_frames import FrameHead
 from fishd.recording import RunWriter
-from fishd.recording.images import FrameHead
 
 
 @pytest.mark.parametrize("length", ["nan", "inf", "-inf", "0"])

@@ -88,7 +88,7 @@ def test_an_error_behind_a_harmless_one_keeps_its_own_reason() -> None:
         ("force_sensor", "48", "; 0x48 may be meant"),
         ("force_sensor", "'0x4b'", "; 0x4b may be meant"),
         ("virtual_pi", "49", "; 0x49 may be meant"),
-        ("power_meter", "40", "; 0x40 may be meant"),
+        ("sensors.power", "40", "; 0x40 may be meant"),
         ("force_sensor", "90", " is needed"),
     ],
 )
@@ -96,8 +96,9 @@ def test_an_i2c_address_without_0x_is_recognised(
     key: str, value: str, hint: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "fish.yaml"
-    driver = "  driver: ina219\n" if key == "power_meter" else ""
-    file.write_text(f"robot: virtual-pi\n{key}:\n{driver}  address: {value}\n")
+    section = f"{{kind: ina219, address: {value}}}" if "." in key else f"{{address: {value}}}"
+    section = section if "." not in key else f"{{power: {section}}}"
+    file.write_text(f"robot: virtual-pi\n{key.partition('.')[0]}: {section}\n")
     with pytest.raises(ConfigError) as caught:
         load(file)
     assert f"{key}.address: " in str(caught.value)

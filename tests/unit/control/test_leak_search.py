@@ -2,7 +2,7 @@
 
 import pytest
 from msgspec import UNSET
-from rigs.harness import Rig
+from rigs.harness import PINNED_TICK, Rig
 
 from fishd.config import load
 from fishd.lab.simulation import simulate
@@ -56,7 +56,9 @@ def test_the_leak_does_not_change_while_the_fish_rests() -> None:
 def test_with_the_leak_swing_thrusts_as_well_as_on_the_default_fish() -> None:
     drag = f"plant.lateral_drag={3.0 * DRAG}"
     share = {
-        leak: simulate(load(None, [f"estimator.leak={leak}", drag]), "swing", {}, 60.0, 30.0)
+        leak: simulate(
+            load(None, [PINNED_TICK, f"estimator.leak={leak}", drag]), "swing", {}, 60.0, 30.0
+        )
         for leak in ("0.3", "auto")
     }
     assert share["0.3"].relative_thrust < 0.85  # a number is not changed
@@ -69,7 +71,7 @@ def test_on_the_default_fish_it_costs_no_thrust(amplitude: float) -> None:
     limit = f"amplitude_limit={amplitude}"
     shares = [
         simulate(
-            load(None, [f"estimator.leak={leak}", limit]), "swing", {}, 60.0, 10.0
+            load(None, [PINNED_TICK, f"estimator.leak={leak}", limit]), "swing", {}, 60.0, 10.0
         ).relative_thrust
         for leak in ("0.3", "auto")
     ]

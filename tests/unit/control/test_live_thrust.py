@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import pytest
 from msgspec import UNSET
 from msgspec.structs import replace
-from rigs.harness import Rig, Wrapped, fragile_rig
+from rigs.harness import PINNED_TICK, Rig, Wrapped, fragile_rig
 
 from fishd.config import load
 from fishd.core.signals import Tick
 from fishd.lab.session import VirtualSession
 
-CONFIG = load(None, ["simulation.drift=0.005", "simulation.noise=0.001"])
+CONFIG = load(None, [PINNED_TICK, "simulation.drift=0.005", "simulation.noise=0.001"])
 TRUTH = 25.74e-3
 
 
@@ -58,7 +58,7 @@ def test_the_interval_shrinks_with_each_change_and_grows_with_time() -> None:
 
 
 def test_two_rests_of_a_quiet_sensor_give_the_thrust_to_five_percent() -> None:
-    with VirtualSession(load(None)) as fish:
+    with VirtualSession(load(None, [PINNED_TICK])) as fish:
         for _ in range(2):
             fish.rest(3.0)
             ticks = fish.swim("swing", {}, 30.0)

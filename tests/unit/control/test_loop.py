@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from msgspec import UNSET, structs
 from rigs.harness import Rig, Scripted, Wrapped, fragile_rig
+from rigs.scripted_sensor import ScriptedSensor
 
 from fishd.core.clock import VirtualClock
 from fishd.core.errors import ControllerFault, Refused, SensorError, ServoError
@@ -290,7 +291,13 @@ class Restless(Wrapped):
         return replace(
             super().robot(),
             truth=lambda: Truth(*self.next_values(3)),
-            power=lambda now: self.next_values(1)[0],
+            sensors=(self.sensor,),
+        )
+
+    @property
+    def sensor(self) -> ScriptedSensor:
+        return ScriptedSensor(
+            latest=lambda: {"water_temperature": (self.clock.now, self.next_values(1)[0])}
         )
 
     def next_values(self, count: int) -> list[float]:
@@ -332,24 +339,3 @@ def test_no_field_of_a_tick_keeps_a_value_of_the_controller(mode: str, may_stay:
     tick = rig.run(20, missed=1, lateness=4e-3)[-1]
     kept = {f for f in Tick.__struct_fields__ if getattr(tick, f) == getattr(running, f)}
     assert kept - ABSENT == may_stay
-
-
-def test_a_simulated_fish_prepares_in_the_warm_up_what_its_next_read_needs() -> None:
-    rig = Rig()
-    rig.start(Scripted(lambda _: 0.1))
-    rig.run(8)
-    requests = []
-    rig.fish.fish.prepare = lambda *request: requests.append(request)
-    rig.loop.warm_up()
-    assert requests == [(0.1, pytest.approx(0.05), rig.run()[-1].samples)]
-
-
-def test_only_the_active_controller_warms_up_and_the_angle_stays() -> None:
-    rig, controller = Rig(), Scripted(lambda _: 0.1)
-    ticks = []
-    controller.warm_up = lambda: ticks.append(rig.loop.seq)  # type: ignore[method-assign]
-    rig.loop.warm_up()
-    rig.start(controller)
-    rig.run()
-    rig.loop.warm_up()
-    assert (ticks, rig.loop.instruction_angle, rig.loop.seq) == ([1], 0.1, 1)

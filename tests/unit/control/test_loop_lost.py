@@ -35,7 +35,6 @@ def test_after_a_hang_the_servo_is_released_until_a_clear(rig: LockstepRig, seco
     stand_still(rig, seconds)
     rig.run_for(1.0)
     assert (rig.mode, rig.reason) == ("fault", "overrun")
-    assert rig.loop.supervisor.reason
     assert rig.loop.supervisor.reason.message == (
         f"fishd stood still for {1e3 * seconds + 50:.0f} ms, and the servo has gone to neutral by "
         "itself, its pulses end within half a second: the machine is overloaded or was suspended"
@@ -117,7 +116,6 @@ def test_a_hang_during_a_write_that_fails_is_reported_as_a_hang() -> None:
 
     robot.write = hang  # type: ignore[method-assign]
     assert rig.run(1)[-1].mode == "fault"
-    assert rig.loop.supervisor.reason
     assert rig.loop.supervisor.reason.code == "overrun"
 
 
@@ -159,7 +157,9 @@ def line(**changes: object) -> str:
     none = Percentiles(0.0, 0.0, 0.0, 0)
     fields = {**dict.fromkeys(Status.__struct_fields__, 0), "timing": Timing(none, none, {})}
     known = {"mode": "fault", "reason": None, "controller": "hold", "thrust": 0.0217}
-    return status_line(Status(**fields | known | {"force_unit": "N", "speed": None} | changes))
+    return status_line(
+        Status(**fields | known | {"force_unit": "N", "speed": None, "readings": {}} | changes)
+    )
 
 
 def test_the_status_line_shows_no_thrust_without_a_force_and_says_that_the_servo_is_lost() -> None:

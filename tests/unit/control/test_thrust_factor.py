@@ -70,7 +70,6 @@ class FactorError(NamedTuple):
 
 
 def factor_error(rig: Rig) -> FactorError:
-    assert rig.live.factor
     value, ci95 = rig.live.factor
     return FactorError(value / TRUE_FACTOR - 1.0, ci95 / TRUE_FACTOR)
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rigs.harness import PINNED_TICK
 from rigs.pictures import letters_of, texts_in_pictures
 from rigs.policy_files import write
 
@@ -14,7 +15,7 @@ from fishd.lab.compare import comparison
 from fishd.lab.compare.comparison import Standing, Trace, compare, judge_standings
 from fishd.lab.compare.contestants import default_contestants, parse
 
-CONFIG = load(None, ["simulation.offset_y=0.005"])
+CONFIG = load(None, [PINNED_TICK, "simulation.offset_y=0.005"])
 FIGURES = "install the extra 'lab'"
 
 
@@ -34,7 +35,7 @@ def test_square_beats_sine_beats_triangle_and_each_is_as_square_as_it_is() -> No
 
 
 def test_the_runs_of_a_contestant_differ_in_noise_and_give_the_interval_of_their_mean() -> None:
-    config = load(None, ["simulation.noise=0.02"])
+    config = load(None, [PINNED_TICK, "simulation.noise=0.02"])
     (standing,), _ = compare(config, ["swing"], 20.0, 5.0, runs=5)
     thrusts = np.array(standing.thrusts)
     assert len(set(thrusts)) > 1
@@ -46,7 +47,7 @@ def test_the_runs_of_a_contestant_differ_in_noise_and_give_the_interval_of_their
 
 def test_it_is_said_that_another_controller_took_over_from_a_policy(tmp_path: Path) -> None:
     shaking = parse(str(write(tmp_path)))
-    (policy, swing), _ = compare(load(None), [shaking, parse("swing")], 20.0, 5.0)
+    (policy, swing), _ = compare(load(None, [PINNED_TICK]), [shaking, parse("swing")], 20.0, 5.0)
     assert "it wanted to reverse sooner than 0.2 s after its last reversal" in policy.fallbacks[0]
     assert (policy.faults, swing.fallbacks) == ([], [])
 
@@ -91,7 +92,7 @@ def test_a_single_run_is_exact_without_noise_and_has_no_verdict_with_it() -> Non
 
 
 def test_what_the_fish_starts_with_takes_no_part() -> None:
-    config = load(None, ["start.controller=hold"])
+    config = load(None, [PINNED_TICK, "start.controller=hold"])
     (standing,), _ = compare(config, [parse("swing")], 20.0, 5.0)
     assert standing.relative_thrust > 0.9
 

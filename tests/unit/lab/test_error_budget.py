@@ -9,8 +9,13 @@ from fishd.config import load
 from fishd.core.calibration import EXACT, ForceCalibration
 from fishd.lab.compare import LiveComparison
 from fishd.lab.compare.survey import harsh
-from fishd.lab.error_budget import budget, format_with_budget, unknown_calibration
-from fishd.lab.measurement import ThrustMeasurement, measure, summarise
+from fishd.lab.error_budget import (
+    Thrust,
+    budget,
+    format_thrust,
+    warn_of_unknown_calibration,
+)
+from fishd.lab.measurement import ThrustMeasurement, measure
 from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import simulate
 
@@ -38,7 +43,7 @@ def test_a_gain_error_is_within_the_total_interval_and_its_part_is_named() -> No
     both = math.hypot(measurement.thrust_ci95, measurement.calibration_ci95)
     assert measurement.total_ci95 == pytest.approx(both)
     assert measurement.thrust_ci95 < abs(measurement.thrust - truth) < measurement.total_ci95
-    report = summarise(measurement, 0.05)
+    report = measurement.summary()
     assert report.power is not None
     expected = measurement.total_ci95 / report.power
     assert report.thrust_per_watt_total_ci95 == pytest.approx(expected, rel=1e-3)
@@ -58,7 +63,6 @@ def test_a_rotation_that_no_load_has_shown_is_seen_in_the_swim_and_covered(angle
     quiet = ("simulation.noise=1e-5", f"simulation.rotation={angle}")
     measurement, truth = measure_swing(*quiet), simulate(load(), "swing", {}).mean_thrust
     assert measurement.rotation == pytest.approx(angle, abs=0.003)
-    assert measurement.total_ci95
     assert truth - measurement.thrust == pytest.approx((1.0 - math.cos(angle)) * truth, rel=0.1)
     error = truth - measurement.thrust
     assert measurement.thrust_ci95 < error < measurement.total_ci95 < 0.02 * truth
@@ -81,13 +85,14 @@ def test_a_hum_and_a_fin_at_rest_turn_no_sensor() -> None:
 def test_without_a_known_calibration_no_total_is_claimed() -> None:
     old = replace(KNOWN, covariance_x=None)
     assert budget(old, 0.025, 1e-4) == (None, None)
-    shown = format_with_budget(0.025, 1e-4, None, None, "N")
+    unknown = Thrust(thrust=0.025, thrust_ci95=1e-4)
+    shown = format_thrust(unknown, "N")
     assert shown.endswith("± 0.10 mN (statistical ± 0.10, calibration unknown)")
-    shown = format_with_budget(0.025, 1e-4, None, None, "V")
+    shown = format_thrust(unknown, "V")
     assert shown.endswith("mV (statistical ± 0.10, calibration none)")
-    assert "the uncertainty of the gains" in unknown_calibration(None, "N")
-    assert "not calibrated: forces are in V" in unknown_calibration(None, "V")
-    assert not unknown_calibration(0.0, "N")
+    assert "the uncertainty of the gains" in warn_of_unknown_calibration(unknown, "N")
+    assert "not calibrated: forces are in V" in warn_of_unknown_calibration(unknown, "V")
+    assert not warn_of_unknown_calibration(replace(unknown, calibration_ci95=0.0), "N")
 
 
 def test_more_runs_do_not_make_the_part_of_the_calibration_smaller() -> None:
@@ -96,7 +101,6 @@ def test_more_runs_do_not_make_the_part_of_the_calibration_smaller() -> None:
         live.swim(21.0, runs=3)
     (standing,) = live.standings()
     assert standing.calibration_ci95 == pytest.approx(0.03 / 1.02 * standing.thrust, rel=1e-3)
-    assert standing.thrust_ci95 is not None
     both = math.hypot(standing.thrust_ci95, standing.calibration_ci95)
     assert standing.total_ci95 == pytest.approx(both)
 

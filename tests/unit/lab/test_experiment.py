@@ -11,13 +11,11 @@ import msgspec
 import pytest
 from rigs.processes import fishctl, one_line
 
-from fishd.config import load
-from fishd.core.errors import ConfigError
+from fishd.core.errors import ConfigError, FishdError
 from fishd.core.signals import Tick
 from fishd.lab.experiment import (
     RESULT,
     Header,
-    count_attempts,
     mark_folder,
     open_experiment,
     read_header,
@@ -32,13 +30,12 @@ HEADER = Header(
 
 def begin(path: Path, header: Header = HEADER) -> None:
     with open_experiment(path, header) as experiment:
-        experiment.read_rows(["x", "y"])
-        experiment.add_row({"x": 0.1, "y": True})
+        experiment.open_table(["x", "y"]).add({"x": 0.1, "y": True})
 
 
 def resume(path: Path, header: Header = HEADER) -> list[dict[str, str]]:
     with open_experiment(path, header, resume=True) as experiment:
-        return experiment.read_rows(["x", "y"])
+        return experiment.open_table(["x", "y"]).rows
 
 
 @pytest.mark.parametrize(
@@ -191,12 +188,19 @@ def test_a_measurement_keeps_header_recording_and_result_and_is_listed(tmp_path:
     assert f"fishctl: {folder}/experiment.json: fishd" in done.stderr
 
 
-def test_each_attempt_at_an_experiment_without_rows_has_noise_of_its_own(tmp_path: Path) -> None:
-    assert count_attempts(tmp_path) == 0
-    noise = []
-    for name in ("excitation.mcap", "excitation-2.mcap.part"):
-        with VirtualSession(load(None)) as session:
-            session.resume(count_attempts(tmp_path))
-            noise.append([tick.fx for tick in session._rest(1.0)])
-        (tmp_path / name).touch()
-    assert not set(noise[0]) & set(noise[1])
+class Value(msgspec.Struct):
+    """Result of a computation that takes long."""
+
+    number: int
+
+
+def test_what_takes_long_is_computed_once_and_again_only_if_it_failed(tmp_path: Path) -> None:
+    def fail() -> Value:
+        raise FishdError("no fish")
+
+    with open_experiment(tmp_path, HEADER) as experiment:
+        with pytest.raises(FishdError, match="no fish"):
+            experiment.once("value.json", Value, fail)
+        assert experiment.once("value.json", Value, lambda: Value(1)) == Value(1)
+    with open_experiment(tmp_path, HEADER, resume=True) as experiment:
+        assert experiment.once("value.json", Value, fail) == Value(1)

@@ -40,22 +40,18 @@ def test_the_backend_of_a_notebook_is_for_the_notebook(tmp_path: Path, plain: by
 
 
 @pytest.mark.parametrize("content", [USETEX.encode(), b"axes.titlecolor: red # caf\xe9\n"])
-def test_a_file_that_somebody_has_put_into_the_working_folder_is_not_read(
-    content: bytes, tmp_path: Path, plain: bytes
+@pytest.mark.parametrize(
+    ("folder", "variable"),
+    [("", "ANY"), ("home/matplotlib", "XDG_CONFIG_HOME"), ("home/matplotlib", "MATPLOTLIBRC")],
+)
+def test_settings_in_the_working_folder_or_of_the_user_are_not_for_fishd(
+    folder: str, variable: str, content: bytes, tmp_path: Path, plain: bytes
 ) -> None:
-    (tmp_path / "matplotlibrc").write_bytes(content)
-    assert draw(tmp_path) == plain
-
-
-@pytest.mark.parametrize("content", [USETEX.encode(), b"axes.titlecolor: red # caf\xe9\n"])
-def test_the_settings_of_the_user_are_for_the_figures_of_the_user(
-    content: bytes, tmp_path: Path, plain: bytes
-) -> None:
-    settings = tmp_path / "home" / "matplotlib"
-    settings.mkdir(parents=True)
+    settings = tmp_path / folder
+    settings.mkdir(parents=True, exist_ok=True)
     (settings / "matplotlibrc").write_bytes(content)
-    assert draw(tmp_path, XDG_CONFIG_HOME=str(settings.parent)) == plain
-    assert draw(tmp_path, MATPLOTLIBRC=str(settings)) == plain
+    path = settings.parent if variable == "XDG_CONFIG_HOME" else settings
+    assert draw(tmp_path, **{variable: str(path)}) == plain
 
 
 @pytest.mark.parametrize("style", [b"# f\xfcr die Fische\n", b"font.sizee: 10\n"])

@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from rigs.policy_files import write
 
 from fishd.config import Config, load
 from fishd.core.errors import ParameterError, Refused
-from fishd.core.signals import Tick
+from fishd.core.signals import Event, Tick
 from fishd.lab.compare import LiveComparison, compare
 from fishd.lab.measurement import measure
 from fishd.lab.session import Disturbed, VirtualSession
@@ -44,9 +45,15 @@ def test_several_runs_come_in_turn() -> None:
                 order.append(controller)
             return super().swim(controller, parameters, seconds)
 
-    with RecordingOrder(DRIFTS) as rig:
+    class Progress:
+        def tick(self, _: Tick) -> None:
+            progress.append(rig.used)
+
+        def event(self, _: Event) -> None:
+            """Accept the event."""
+
+    with RecordingOrder(DRIFTS) as rig, rig.heard_by(Progress()):
         live = LiveComparison(rig, ["swing", "sine"])
-        rig.progress = progress.append
         live.swim(25.0, runs=2)
         standing = live.standings()[0]
     assert order == ["swing", "sine", "swing", "sine"]
@@ -69,7 +76,7 @@ def test_the_error_of_several_runs_is_what_they_are_known_to_or_how_they_differ(
 ) -> None:
     with VirtualSession(DRIFTS) as rig:
         measurement = measure(rig, "swing", {}, 21.0)
-        runs = [measurement._replace(thrust=thrust, thrust_ci95=0.3e-3) for thrust in thrusts]
+        runs = [replace(measurement, thrust=thrust, thrust_ci95=0.3e-3) for thrust in thrusts]
         monkeypatch.setattr("fishd.lab.compare.live.measure", lambda *_: runs.pop(0))
         live = LiveComparison(rig, ["swing"])
         live.swim(21.0, runs=len(runs))

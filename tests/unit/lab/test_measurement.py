@@ -217,10 +217,10 @@ def test_where_a_swim_has_one_beat_those_of_others_say_how_sure_its_thrust_and_p
         alike += evaluate(make_candidate(generator, 4), 0.05, 0.75, other_steps=alike).steps
         evaluation = evaluate(make_candidate(generator, 6), 0.05, 0.75, other_steps=alike)
         assert not evaluation.steps  # of one beat
-        assert evaluation.watts is not None
-        assert evaluation.watts_ci95 is not None
+        assert evaluation.power is not None
+        assert evaluation.power_ci95 is not None
         thrust_missed += abs(evaluation.thrust - 0.02) > evaluation.thrust_ci95
-        power_missed += abs(evaluation.watts - 0.5) > evaluation.watts_ci95
+        power_missed += abs(evaluation.power - 0.5) > evaluation.power_ci95
     assert thrust_missed <= 9  # of 60; three are expected
     assert power_missed <= 9
 

@@ -14,7 +14,7 @@ from fishd.config import load
 from fishd.core.errors import ParameterError
 from fishd.lab.compare.comparison import compare
 from fishd.lab.compare.live import LiveComparison
-from fishd.lab.measurement import measure, summarise
+from fishd.lab.measurement import measure
 from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Range
 from fishd.lab.optimise.trials import Aim, Trial
@@ -28,7 +28,7 @@ RANGE = Range("frequency", 0.5, 5.0)
 
 def test_a_measurement_tells_power_and_thrust_per_watt_with_their_intervals() -> None:
     with VirtualSession(DRIFTING) as rig:
-        report = summarise(measure(rig, "swing", {}, 40.0), rig.tick)
+        report = measure(rig, "swing", {}, 40.0).summary()
     truth = simulate(DRIFTING, "swing", {})
     assert report.power == pytest.approx(truth.mean_power, rel=0.01)
     assert report.thrust_per_watt == pytest.approx(report.thrust / report.power)
@@ -40,9 +40,9 @@ def test_a_measurement_tells_power_and_thrust_per_watt_with_their_intervals() ->
 
 @pytest.mark.slow
 def test_without_a_power_meter_a_measurement_tells_the_thrust_alone() -> None:
-    config = load("config/virtual-pi.yaml", ["power_meter=null"])
+    config = load("config/virtual-pi.yaml", ["sensors.power_meter=null"])
     with VirtualSession(config) as rig:
-        report = summarise(measure(rig, "square", {"frequency": 2.0}, 20.5), rig.tick)
+        report = measure(rig, "square", {"frequency": 2.0}, 20.5).summary()
     assert report.thrust > 0.0
     assert (report.power, report.power_ci95, report.thrust_per_watt) == (None, None, None)
 

@@ -40,7 +40,6 @@ def phase_of(beat: MeanBeat, values: Array, harmonic: int) -> float:
 def test_the_mean_beat_has_the_phase_and_the_mean_of_the_forces(frequency: float) -> None:
     traces = swum(frequency, "sine")
     beat = mean_beat(traces, slice(None))
-    assert beat
     delay = np.pi * frequency * TICK  # a command holds for a tick, so its beat begins later
     lag = phase_of(beat, beat.fy, 1) + 0.5 * np.pi
     assert lag == pytest.approx(delay - LAG, abs=np.radians(1.0))
@@ -52,7 +51,6 @@ def test_the_mean_beat_has_the_phase_and_the_mean_of_the_forces(frequency: float
 def test_a_square_wave_begins_its_beat_when_the_command_changes(ticks: int) -> None:
     frequency = 0.5 / (ticks * TICK)
     beat = mean_beat(swum(frequency, "square"), slice(None))
-    assert beat
     assert len(beat.phase) == 2 * ticks
     lag = phase_of(beat, beat.fy, 1) + 0.5 * np.pi
     assert lag == pytest.approx(-LAG, abs=np.radians(0.5))
@@ -62,7 +60,6 @@ def test_a_square_wave_begins_its_beat_when_the_command_changes(ticks: int) -> N
 @pytest.mark.parametrize("frequency", [1.0, 1.27, 1.625, 1.6667, 1.683])
 def test_a_peak_has_the_amplitude_of_its_wave_between_frequencies_too(frequency: float) -> None:
     spectral = spectrum(swum(frequency, "sine"), slice(None))
-    assert spectral
     averaged = np.sinc(frequency * TICK)
     assert spectral.fy.max() == pytest.approx(SINGLE * averaged, rel=0.005)
     assert spectral.fx.max() == pytest.approx(DOUBLE * np.sinc(2 * frequency * TICK), rel=0.005)
@@ -73,7 +70,6 @@ def test_the_densities_add_up_to_the_variance_of_the_forces() -> None:
     noise = np.random.default_rng(7).normal(0.0, 3.0, len(traces.time))
     noisy = traces._replace(fy=noise)
     spectral = spectrum(noisy, slice(None))
-    assert spectral
     step = spectral.frequency[1] - spectral.frequency[0]
     assert step * spectral.fy_density.sum() == pytest.approx(noise.var(), rel=0.15)
     assert step * spectral.fx_density.sum() == pytest.approx(traces.fx.var(), rel=0.01)

@@ -10,10 +10,10 @@ from fishd.config import Config, load
 from fishd.core.errors import RecordingError
 from fishd.core.signals import Event, Tick
 from fishd.lab.identification import Unidentifiable, identify
+from fishd.lab.rerun import rerun
 from fishd.lab.run_traces import traces
 from fishd.lab.session import VirtualSession
 from fishd.recording import open_run
-from fishd.recording.rerun import rerun
 
 
 def test_every_swim_of_a_rig_is_rerun_to_the_last_bit(tmp_path: Path) -> None:
@@ -50,10 +50,12 @@ class FullDisk:
 
 
 def test_a_recording_that_fails_ends_a_swim_and_is_no_fault_of_the_fish() -> None:
-    with VirtualSession(Config()) as rig:
-        rig.listener = FullDisk(50)
-        with pytest.raises(RecordingError, match="no room"):
-            rig.swim("swing", {}, 10.0)
+    with (
+        VirtualSession(Config()) as rig,
+        rig.heard_by(FullDisk(50)),
+        pytest.raises(RecordingError, match="no room"),
+    ):
+        rig.swim("swing", {}, 10.0)
 
 
 def test_what_swam_before_a_kill_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

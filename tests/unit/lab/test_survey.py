@@ -35,7 +35,6 @@ def test_it_tells_who_shook_the_servo_and_who_lost_command(tmp_path: Path) -> No
     shaken, held = flip.fish
     assert (shaken.longest_chatter_s, shaken.fallback) == (pytest.approx(8.0, abs=0.2), None)
     assert held.longest_chatter_s == 0.0
-    assert held.fallback is not None
     assert held.fallback.startswith("ppo gave up")
 
 

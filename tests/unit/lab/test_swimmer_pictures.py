@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from fishd.core.errors import FishdError
-from fishd.lab.swimmer import midlines, wake
+from fishd.lab.swimmer import wake
 from fishd.lab.swimmer.film import MAX_FRAMES, Film
 from fishd.lab.swimmer.midlines import compute_envelope
 from fishd.virtual.swimmer.fish import Fish
@@ -116,13 +116,6 @@ def test_a_film_is_half_as_fast_as_the_fish_where_ticks_are_long(kind: str, tmp_
         assert shown.info["duration"] == 100  # of 50 ms
 
 
-def test_a_film_of_another_kind_is_refused_before_anything_swims(tmp_path: Path) -> None:
-    with pytest.raises(FishdError, match=r"a film has no format \.mp4: \.webp or \.gif is needed"):
-        Film(tmp_path / "wake.mp4", COARSE)
-    with pytest.raises(FishdError, match="does not exist"):
-        Film(tmp_path / "none" / "wake.webp", COARSE)
-
-
 def make_midlines(beats: float, frequency: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
     """Return midlines of a stiff body whose tail beats by ±0.1 L, obliquely to the axes."""
     time = np.arange(0.0, beats / frequency, 0.005)
@@ -146,10 +139,3 @@ def test_midlines_are_relative_to_the_mean_motion_wherever_the_fish_goes() -> No
 def test_a_tail_that_does_not_beat_has_no_midlines_of_a_beat() -> None:
     with pytest.raises(FishdError, match="does not complete a beat"):
         compute_envelope(*make_midlines(0.7))
-
-
-def test_a_picture_of_midlines_is_written(tmp_path: Path) -> None:
-    envelope = compute_envelope(*make_midlines(3.5))
-    midlines.draw_midlines(envelope, "a sine of 2 Hz", tmp_path / "midlines.png")
-    with Image.open(tmp_path / "midlines.png") as picture:
-        assert picture.width == 1440

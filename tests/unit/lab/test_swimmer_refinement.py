@@ -9,7 +9,6 @@ from rigs.processes import fishctl, one_line, sets
 
 from fishd.config import load
 from fishd.core.errors import FishdError
-from fishd.lab.sweep import measuring
 from fishd.lab.swimmer import refinement
 from fishd.lab.swimmer.refinement import GridSpeed, Refinement
 
@@ -107,7 +106,9 @@ def test_a_speed_has_its_error_by_the_grid_after_a_refinement(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    monkeypatch.setattr(measuring, "MAX_SWIM_S", 0.4)  # any speed has an error by the grid
+    monkeypatch.setattr(
+        "fishd.lab.swimmer.speed.MAX_SWIM_S", 0.4
+    )  # any speed has an error by the grid
     fish = (*OPTIONS, *sets("swimmer.numerics.cell=0.001", "swimmer.numerics.step=0.0005"))
     gait = ("sine", "--frequency", "10")
     brief = ("simulate", *gait, *OPTIONS, "--for", "0.5", "--settle", "0.2")

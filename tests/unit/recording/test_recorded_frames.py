@@ -14,13 +14,12 @@ from rigs.filmed_swim import filmed, swum
 from rigs.harness import Rig
 
 from fishd.camera.simulated import DEFAULT
-from fishd.core.camera_frames import Frame
+from fishd.core.camera_frames import Frame, FrameHead
 from fishd.core.errors import RecordingError
 from fishd.core.signals import Tick
 from fishd.recording import RunWriter, open_run
 from fishd.recording.export import export
 from fishd.recording.folder import read_overview
-from fishd.recording.images import FrameHead
 from fishd.recording.recover import recover
 
 UNIX = 1.7e9

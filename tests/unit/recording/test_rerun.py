@@ -11,8 +11,8 @@ from rigs.reversed_force import reversed_robot
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.core.errors import ParameterError, RecordingError
+from fishd.lab.rerun import Rerun, rerun
 from fishd.recording import RunWriter, open_run
-from fishd.recording.rerun import Rerun, rerun
 
 
 def rerun_of(rig: Rig, path: Path) -> Rerun:
@@ -183,6 +183,6 @@ def test_time_stands_still_for_a_controller_only_where_it_did(
         seen.append(limits.virtual)
         return registry.create(name, parameters, limits)
 
-    monkeypatch.setattr("fishd.recording.rerun.registry", SimpleNamespace(create=create))
+    monkeypatch.setattr("fishd.lab.rerun.registry", SimpleNamespace(create=create))
     rerun(open_run(path))
     assert seen == [virtual]

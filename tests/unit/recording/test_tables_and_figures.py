@@ -8,13 +8,14 @@ import numpy as np
 import pandas
 import pyarrow.parquet
 import pytest
+from mcap.records import Schema
 from rigs.harness import Rig
 from rigs.processes import fishctl, one_line
 from rigs.recordings import record_run, swum, write
 
 from fishd.lab.run_figure import draw_run
 from fishd.lab.run_traces import MIN_FORCE_SPAN, limits, mean_beat, spectrum, traces
-from fishd.recording import open_run
+from fishd.recording import RunWriter, open_run
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +78,34 @@ def test_a_curve_has_breaks_and_events_and_units_are_said(path: Path, tmp_path: 
     assert [index for index, value in enumerate(drawn.fx) if value != value] == [20]
     expected = ["swing C=0.6 longest_half_period=1 s lead=0 s", "C=0.3"]
     assert [event.text for event in traces(open_run(path)).events] == expected
-    assert list(drawn.quantities) == ["top_speed", "reversal_speed", "since_reversal (s)"]
+    assert list(drawn.quantities) == [
+        *("power", "top_speed", "reversal_speed", "since_reversal (s)")
+    ]
+
+
+def test_readings_of_sensors_are_columns_curves_and_means_with_their_units(tmp_path: Path) -> None:
+    rig = Rig("sensors.water={kind: simulated, value: 21, amplitude: 0, low: 0, high: 20}")
+    rig.start("square", frequency=2).run(20)
+    with RunWriter(tmp_path / "run") as writer:
+        writer.describe(rig.config, {}, rig.loop.readings.declared)
+        for tick in rig.recorder.ticks:
+            writer.tick(tick)
+    run = open_run(writer.path)
+    assert run.reading_units == {"power": "W", "water_temperature": "°C"}
+    table = run.frame()
+    assert table["readings.water_temperature"].tolist()[2:] == [21.0] * 18
+    assert {"power (W)", "water_temperature (°C)"} <= traces(run).quantities.keys()
+    assert run.summary.readings == {
+        "power": pytest.approx(table["readings.power"].mean()),
+        "water_temperature": 21.0,
+    }
+    (schema,) = {
+        record.data
+        for _, record in run.records()
+        if isinstance(record, Schema) and record.name == "fishd.Tick"
+    }
+    properties = json.loads(schema)["properties"]["readings"]["properties"]
+    assert properties["water_temperature"]["description"] == "Simulated reading. [°C]"
 
 
 def test_spectrum_and_mean_beat_of_a_swim_show_its_frequency_and_no_gap(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rigs.documents import ROOT
+from rigs.harness import PINNED_TICK
 from rigs.processes import fishctl, one_line
 
 from fishd.assembly import simulated_fish
@@ -23,7 +24,9 @@ from fishd.virtual.plant.optimum import square_wave
 
 @pytest.mark.parametrize("start", [0.0, 12_345.67])
 def test_the_same_seed_drifts_in_the_same_way_whenever_it_starts(start: float) -> None:
-    config = load(None, ["simulation.drift=0.02", "simulation.noise=0", "simulation.seed=3"])
+    config = load(
+        None, [PINNED_TICK, "simulation.drift=0.02", "simulation.noise=0", "simulation.seed=3"]
+    )
     fish = simulated_fish(config)
     forces = [fish.read(start + 0.05 * n).fx for n in range(1, 200)]
     drift = Imperfections(config.simulation, config.tick)
@@ -32,7 +35,7 @@ def test_the_same_seed_drifts_in_the_same_way_whenever_it_starts(start: float) -
 
 
 def test_figures_are_those_of_the_plant_and_not_of_the_sensor() -> None:
-    config = load(None, ["simulation.offset_x=0.5", "simulation.noise=0"])
+    config = load(None, [PINNED_TICK, "simulation.offset_x=0.5", "simulation.noise=0"])
     report = simulate(config, "square", {"frequency": 2.0})
     truth = square_wave(config.plant, 0.42, 2.0)
     assert report.mean_thrust == pytest.approx(truth.thrust, rel=1e-6)
@@ -69,7 +72,7 @@ def test_a_length_that_leaves_nothing_is_refused(seconds: float, settle: float, 
 
 
 def test_slack_that_swallows_the_whole_amplitude_leaves_nothing_to_compare_with() -> None:
-    report = simulate(load(None, ["plant.cable_slack=0.5"]), "square", {}, 20)
+    report = simulate(load(None, [PINNED_TICK, "plant.cable_slack=0.5"]), "square", {}, 20)
     assert (report.mean_thrust, report.relative_thrust) == (0.0, 0.0)
 
 
@@ -164,7 +167,7 @@ def test_a_run_is_a_table_with_a_row_a_tick_and_the_same_numbers_as_a_report() -
     assert list(table["seq"]) == list(range(1, 801))
     assert set(table["phi_c"]) == {-0.42, 0.42}
     assert "quantities.phase" in table
-    report = simulate(load(None), "square", {"frequency": 1.7}, 40.0)
+    report = simulate(load(None, [PINNED_TICK]), "square", {"frequency": 1.7}, 40.0)
     assert table["fx"][300:].mean() == pytest.approx(report.mean_thrust, rel=0.01)
 
 

@@ -291,7 +291,7 @@ def describe_board(context: Context) -> Board:
         python=platform.python_version(),
         fishd=__version__,
         packages=versions,
-        drivers={section: settings.driver for section, _, settings in context.drivers},
+        drivers={driver.section: driver.name for driver in context.drivers},
     )
 
 

@@ -176,19 +176,6 @@ def leave_pulses_of_the_peripheral(bench: Bench, width: float = 1740.0) -> None:
     assert bench.width == pytest.approx(width, abs=0.1)
 
 
-@pytest.mark.parametrize("restarted", [False, True])
-def test_the_last_resort_ends_them_at_neutral_and_says_so(bench: Bench, restarted: bool) -> None:
-    leave_pulses_of_the_peripheral(bench)
-    if restarted:
-        bench.faults.inject("pigpiod-restart")
-    begun = bench.clock.now
-    assert bench.last_resort() is True
-    bench.wait(1.0)
-    assert bench.width == 0
-    assert 1500 in [width for _, width in bench.changes_after(begun)]
-    assert bench.last_resort() is False
-
-
 def test_a_fishd_that_starts_ends_them_at_neutral(bench: Bench) -> None:
     leave_pulses_of_the_peripheral(bench)
     bench.faults.inject("pigpiod-restart")

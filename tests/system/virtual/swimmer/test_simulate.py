@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rigs.coarse_swimmer import OPTIONS, coarse
+from rigs.coarse_swimmer import OPTIONS
 from rigs.processes import FISHCTL, PATIENCE, fishctl, one_line, sets
 
-from fishd.lab.swimmer.free_swim import swim
 from fishd.virtual.swimmer import checkpoint
 from fishd.virtual.swimmer.track import COLUMNS
 
@@ -143,27 +142,15 @@ def test_what_is_no_checkpoint_is_said_to_be_none(tmp_path: Path, content: bytes
     assert line == f"fishctl: {tmp_path}/kept: it is not a swim of 'fishctl simulate --to'\n"
 
 
-def bad(array: np.ndarray[Any, Any], value: float) -> np.ndarray[Any, Any]:
-    array = array.copy()
-    array.flat[-1] = value
-    return array
-
-
 @pytest.mark.parametrize(
     ("name", "change", "complaint"),
     [
-        ("state.u", lambda u: u[:1], r"u is of shape \(1, \d+\) and type float32, and needs to be"),
-        ("state.p", lambda p: p.astype(complex), r"p is of shape .* and type complex128"),
-        ("state.velocity", lambda v: bad(v, np.inf), "velocity has values that are not finite"),
-        ("state.robot", lambda r: bad(r, np.nan), "robot has values that are not finite"),
-        ("state.steps", lambda steps: -steps, "steps is negative"),
-        ("state.steps", lambda steps: steps + 6, "time ends at 4 s, and the fish is at 4.01 s"),
-        ("speed", lambda speed: bad(speed, np.nan), "speed has values that are not finite"),
-        ("x", lambda x: x[:0], "x is of shape"),
-        ("midlines", lambda midlines: midlines[:, :5], "midlines is of shape"),
+        ("state.u", lambda u: u[:1], r"of another version of fishd, and does not fit \('u'\)"),
+        ("state.p", lambda p: p.astype(complex), r"of another version .* does not fit \('p'\)"),
+        ("x", lambda x: x[:0], "not a swim of 'fishctl simulate --to'"),
     ],
 )
-def test_a_damaged_swim_is_said_to_be_with_the_array_that_is(
+def test_a_swim_with_other_arrays_is_refused(
     swum: tuple[dict[str, Any], Path],
     tmp_path: Path,
     name: str,
@@ -171,10 +158,10 @@ def test_a_damaged_swim_is_said_to_be_with_the_array_that_is(
     complaint: str,
 ) -> None:
     arrays = table(swum[1] / "swim.npz")
-    damaged = tmp_path / "kept.npz"
-    np.savez(damaged, **arrays | {name: np.asarray(change(arrays[name]))})
-    line = one_line(simulate("sine", "--for", "0.2", "--settle", "0.1", "--resume", damaged))
-    assert re.match(rf"fishctl: {damaged}: it is damaged: {complaint}", line)
+    other = tmp_path / "kept.npz"
+    np.savez(other, **arrays | {name: np.asarray(change(arrays[name]))})
+    line = one_line(simulate("sine", "--for", "0.2", "--settle", "0.1", "--resume", other))
+    assert re.match(rf"fishctl: {other}: it is {complaint}", line)
 
 
 def test_a_checkpoint_that_would_fill_the_memory_is_not_unpacked(
@@ -299,8 +286,3 @@ def test_a_recording_has_where_the_fish_was(tmp_path: Path) -> None:
     assert done.returncode == 0
     header = (tmp_path / "swim.csv").read_text().partition("\n")[0].split(",")
     assert {"x", "y", "speed", "heading"} <= set(header)
-
-
-def test_the_same_swim_gives_the_same_track() -> None:
-    first, second = (swim(coarse(), "swing", {"C": 0.6}, 0.5, 0.1).track.rows() for _ in range(2))
-    assert np.array_equal(first, second)

@@ -110,5 +110,4 @@ def test_the_loop_of_fishd_refuses_it_and_names_who_lets_it_swim(tmp_path: Path)
 def test_a_description_says_what_it_sees(tmp_path: Path) -> None:
     description = library.describe(str(write(tmp_path, FOLLOWER, "eye")))
     assert (description.problem, description.inputs) == ("", "pictures")
-    assert description.card
     assert description.card["pictures"]["frames"] == 2

@@ -38,7 +38,6 @@ def test_a_network_sees_the_latest_ticks_newest_first(tmp_path: Path) -> None:
     controller.activate(seen(0, angles[0]))
     given = []
     for tick, angle in enumerate(angles):
-        controller.warm_up()  # which does not count as a tick
         given.append(controller.update(seen(tick, angle)))
     assert given == pytest.approx([0.1, 0.1, 0.1, 0.2, -0.3], abs=1e-6)
 

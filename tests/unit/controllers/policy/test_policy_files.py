@@ -67,19 +67,14 @@ def test_an_archive_of_torch_or_baselines_is_refused_and_never_unpickled(tmp_pat
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w") as made:
         made.writestr("policy/data.pkl", pickle.dumps(Trap(tmp_path / "trace")))
-    message = refusal(archive.getvalue())
-    assert message == (
-        "this is a zip archive as torch writes, with a pickle, which could run any code; "
-        + file.WRITERS
-    )
+    pickled = "this is a zip archive as torch writes, with a pickle, which could run any code; "
+    assert refusal(archive.getvalue()) == pickled + file.WRITERS
     assert not (tmp_path / "trace").exists()
     with zipfile.ZipFile(archive, "a") as made:
         made.writestr("_stable_baselines3_version", "2.9.2")
-    assert refusal(archive.getvalue()) == (
-        "this is a model of stable-baselines3, with pickles, which could run any code: load it "
-        "with env=gymnasium.make('fishd/Swim-v0'), and write it with "
-        "fishd.learning.export.export_model"
-    )
+    message = refusal(archive.getvalue())
+    assert message.startswith("this is a model of stable-baselines3, with pickles, which could ")
+    assert message.endswith("write it with fishd.learning.export.export_model")
 
 
 def test_the_writers_that_a_refusal_names_exist() -> None:
@@ -240,14 +235,13 @@ def of_another_tool(*inputs: Any, outputs: int = 1) -> Any:
 
 def test_a_file_of_another_tool_is_refused_with_its_ends_and_the_way_to_a_policy_file() -> None:
     observation = helper.make_tensor_value_info("obs", TensorProto.FLOAT, ["batch", 5])
-    assert refusal(of_another_tool(observation).SerializeToString()) == (
-        "this ONNX file does not contain the observation, tick and Φ of its training: its metadata "
-        "lacks fishd.card. Its inputs: float32 of shape [batch, 5] named 'obs'; its outputs: "
-        "float32 of shape [1] named 'out0'. Write a model of stable-baselines3 with "
-        "fishd.learning.export.export_model; for any other, name the input 'observation' and the "
-        "output 'action', float32 of shapes [1, N] and [1, 1], add the card, and call "
-        "fishd.controllers.policy.file.seal as the last step"
+    message = refusal(of_another_tool(observation).SerializeToString())
+    assert (
+        "its metadata lacks fishd.card. Its inputs: float32 of shape [batch, 5] named 'ob"
+        in message
     )
+    assert "its outputs: float32 of shape [1] named 'out0'. Write a model of stable-ba" in message
+    assert message.endswith(f"add the card, and {SEAL_REMEDY}")
 
 
 def test_of_many_outputs_a_refusal_names_the_first() -> None:

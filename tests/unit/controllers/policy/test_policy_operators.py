@@ -138,14 +138,21 @@ def test_a_newer_format_than_onnx_reads_is_refused_with_the_one_to_set() -> None
     )
 
 
+def write_products(folder: Path, count: int, rows: int, width: int, tick: float = 0.05) -> Path:
+    """Write a network of matrix products with the same weights."""
+    names = ["wide", *(f"v{number}" for number in range(count - 1)), "narrow"]
+    nodes = [
+        make("Expand", ["observation", "s"], ["wide"]),
+        *(make("MatMul", [a, "w"], [b]) for a, b in pairwise(names)),
+        make("ReduceMean", ["narrow"], ["action"]),
+    ]
+    weights = [integers("s", rows, width), floats("w", width, width)]
+    return write(folder, of_nodes(nodes, weights, card(tick=tick)))
+
+
 def test_a_network_that_takes_over_half_a_tick_is_refused_with_its_time(tmp_path: Path) -> None:
     """80 products with the same weights: some 8 ms on a fast machine, for a tick of 2 ms."""
-    names = ["wide", *(f"v{number}" for number in range(79)), "narrow"]
-    chain = [make("MatMul", [a, "w"], [b]) for a, b in pairwise(names)]
-    wide, mean = ("Expand", ["observation", "s"], ["wide"]), ("ReduceMean", ["narrow"], ["action"])
-    nodes = [make(*wide), *chain, make(*mean)]
-    weights = [integers("s", 1, 1100), floats("w", 1100, 1100)]
-    path = write(tmp_path, of_nodes(nodes, weights, card(tick=0.002)))
+    path = write_products(tmp_path, 80, 1, 1100, tick=0.002)
     with pytest.raises(PolicyError) as caught:
         Network(file.read(path))
     expected = (
@@ -165,13 +172,7 @@ class CountingNetwork(Network):
 
 def test_a_network_that_takes_seconds_is_refused_after_a_few_runs(tmp_path: Path) -> None:
     """Each of the 40 products has 10⁹ multiplications: a second for one run, not for eight."""
-    names = ["wide", *(f"v{number}" for number in range(39)), "narrow"]
-    nodes = [
-        make("Expand", ["observation", "s"], ["wide"]),
-        *(make("MatMul", [a, "w"], [b]) for a, b in pairwise(names)),
-        make("ReduceMean", ["narrow"], ["action"]),
-    ]
-    path = write(tmp_path, of_nodes(nodes, [integers("s", 1000, 1000), floats("w", 1000, 1000)]))
+    path = write_products(tmp_path, 40, 1000, 1000)
     with pytest.raises(PolicyError, match=r"this machine takes [\d.e+]+ ms to run it once"):
         CountingNetwork(file.read(path))
     assert CountingNetwork.runs < 8

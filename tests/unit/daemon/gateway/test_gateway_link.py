@@ -1,16 +1,12 @@
-"""Messages between fishd and its gateways."""
-
-import os
-import socket
-from pathlib import Path
+"""Messages between fishd and its gateway."""
 
 import pytest
 import zmq
 from hypothesis import given
 from hypothesis import strategies as st
-from rigs.processes import wait_until
 
 from fishd.daemon.gateway import link
+from fishd.daemon.gateway.server import GatewayServer
 
 
 @given(topic=st.sampled_from([b"tick", b"event", b"status"]), payload=st.binary())
@@ -48,29 +44,33 @@ def test_a_link_never_blocks_its_sender() -> None:
         fill()
 
 
-def count_files() -> int:
-    return len(list(Path("/proc/self/fd").iterdir()))
-
-
-def test_a_socket_that_is_created_again_and_again_keeps_few_listeners(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("messages", "wanted"),
+    [
+        ([b"\x01tick"], True),
+        ([b"\x01"], True),
+        ([b"\x01ti"], True),
+        ([b"\x01event", b"\x01ticks", b"", b"\x05tick", b"tick"], False),
+        ([b"\x01tick", b"\x01", b"\x00tick"], True),
+        ([b"\x01tick", b"\x01", b"\x00", b"\x00tick"], False),
+    ],
+)
+def test_fishd_sends_ticks_only_while_a_subscription_matches_them(
+    messages: list[bytes], wanted: bool
 ) -> None:
-    monkeypatch.setattr(link, "_former_listeners", [])
-    path = tmp_path / "control"
-    with zmq.Context() as context, context.socket(zmq.ROUTER) as server:
-        before = count_files()
-        for _ in range(5 * link.MAX_FORMER_LISTENERS):
-            path.unlink(missing_ok=True)
-            with socket.socket(socket.AF_UNIX) as listener:
-                listener.bind(str(path))
-                listener.listen()
-                link.listen(
-                    server, link.LISTEN + f"ipc://{path}".encode(), os.dup(listener.fileno())
-                )
-        wait_until(lambda: count_files() <= before + link.MAX_FORMER_LISTENERS)
-        with context.socket(zmq.DEALER) as client:
-            client.set(zmq.LINGER, 0)
-            client.connect(f"ipc://{path}")
-            client.send(b"request")
-            assert server.poll(60_000)
-            assert server.recv_multipart()[-1] == b"request"
+    ours, theirs = link.pair()
+    with ours, theirs, zmq.Context() as context, context.socket(zmq.PAIR) as subscribers:
+        subscribers.bind("inproc://subscribers")
+        with context.socket(zmq.PAIR) as telemetry:
+            telemetry.connect("inproc://subscribers")
+            for message in messages:
+                subscribers.send(message)
+            server = GatewayServer(theirs)
+            server._take_subscriptions(telemetry)
+            server._request_ticks()
+            server._request_ticks()  # it is said once
+            server._context.destroy(linger=0)
+        said = [ours.recv(100)] if wanted else []
+        assert said == ([link.TICKS + b"\x01"] if wanted else [])
+        with pytest.raises(BlockingIOError):
+            ours.recv(100)

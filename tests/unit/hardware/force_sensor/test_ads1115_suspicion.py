@@ -30,16 +30,10 @@ def test_a_code_that_is_the_same_after_a_gap_was_not_frozen_for_all_that_time() 
         assert not measurements(ticks.run(0.2))[-1].suspect
 
 
+@pytest.mark.parametrize("bits", [16, 12])
 @pytest.mark.parametrize(("volts", "end"), [(3.0, "+2.048"), (-3.0, "-2.048")])
-def test_a_clipped_channel_is_named_with_its_limit(rig: ForceRig, volts: float, end: str) -> None:
-    rig.volts["A2-A3"] = volts
-    measured = Ticks(rig.sensor()).next()
-    assert measured.suspect == f"F_y (channel A2-A3) is clipped at {end} V"
-
-
-@pytest.mark.parametrize(("volts", "end"), [(3.0, "+2.048"), (-3.0, "-2.048")])
-def test_the_largest_code_of_an_ads1015_is_clipped_too(volts: float, end: str) -> None:
-    with ForceRig(bits=12) as rig:
+def test_a_clipped_channel_is_named_with_its_limit(volts: float, end: str, bits: int) -> None:
+    with ForceRig(bits=bits) as rig:
         rig.volts["A2-A3"] = volts
         measured = Ticks(rig.sensor()).next()
     assert measured.suspect == f"F_y (channel A2-A3) is clipped at {end} V"

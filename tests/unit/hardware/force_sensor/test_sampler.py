@@ -174,7 +174,6 @@ def test_the_forces_of_a_window_are_those_at_its_mean_time(count: int, y_first: 
         pairs.append(Pair(first - 0.5e-3, second + 0.5e-3, x, y))
     evaluation = WindowEvaluation(ForceSensorSettings(), ("F_x", "F_y"), "V")
     measured = evaluation.measure(pairs, ForceCalibration())
-    assert measured.mean_time is not None
     assert (measured.fx, measured.fy) == pytest.approx((measured.mean_time,) * 2, abs=1e-9)
     # Without the weights, an odd number would shift them by a quarter of a pair.
     assert measured.mean_time == pytest.approx(0.5 * (pairs[0].begun + pairs[-1].time))
@@ -188,7 +187,6 @@ def test_the_span_of_a_window_has_the_curvature_of_its_samples(count: int) -> No
     evaluation = WindowEvaluation(ForceSensorSettings(), ("F_x", "F_y"), "V")
     measured = evaluation.measure(pairs, ForceCalibration())
     middle, span = measured.mean_time, measured.span
-    assert middle is not None
     even = [middle + span * ((k + 0.5) / count - 0.5) for k in range(count)]
     wanted = sum(t * t for t in even) / count
     assert 0.5 * (measured.fx + measured.fy) == pytest.approx(wanted, rel=5e-3)

@@ -1,7 +1,6 @@
 """Errors of the bus and the chip: messages and behaviour of the sampler during and after them."""
 
 import gc
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,6 @@ import pytest
 from rigs.ads1115_board import ABSENT_BUS
 from rigs.force_rig import STEP, ForceRig, take_pairs, volts
 
-from fishd.core.errors import MissingPackage
-from fishd.hardware.registry import driver_packages
 from fishd.hardware.sampler import MAX_PAUSE_S
 from fishd.virtual.pi.linux_i2c import LinuxI2c
 
@@ -184,12 +181,3 @@ def test_a_hanging_bus_keeps_the_sampler_for_20_ms_not_the_kernels_second(rig: F
     started = rig.clock.now
     sampler.step()
     assert rig.clock.now - started < 0.03
-
-
-def test_without_its_packages_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    single_shot = "fishd.hardware.force_sensor.ads1115_single_shot"
-    monkeypatch.setitem(sys.modules, "adafruit_ads1x15", None)
-    monkeypatch.delitem(sys.modules, single_shot, raising=False)
-    monkeypatch.delattr("fishd.hardware.force_sensor.ads1115_single_shot", raising=False)
-    with pytest.raises(MissingPackage, match=r"install fishd\[pi\]"), driver_packages("ads1115"):
-        ForceRig().sampler()

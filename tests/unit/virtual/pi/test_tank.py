@@ -88,7 +88,7 @@ def test_without_pulses_the_wheel_stays_where_it_is() -> None:
     wheel = fish_at((ANGLE_LEFT, 0.06)).state.phi
     assert 0.1 < wheel < ANGLE_LEFT
     assert rig.tank.truth().phi == pytest.approx(wheel)
-    assert rig.tank.angle(5.0) is None
+    assert rig.tank.instruction_angle(5.0) is None
 
 
 def test_the_servo_may_be_mounted_the_other_way_round() -> None:

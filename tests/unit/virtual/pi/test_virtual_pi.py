@@ -55,7 +55,7 @@ def test_faults_reach_both_halves_of_the_pi(pi: VirtualPi, clock: VirtualClock) 
     clock.now += 1.0
     assert pi.bus.transfer(0x48, [Read(1)])
     assert pi.state().pulse == 0.0
-    assert pi.state().angle is None
+    assert pi.state().phi_c is None
     wheel = TetheredFish(PlantParameters())
     wheel.advance(AMPLITUDE, 0.09, 1)
     assert pi.tank.truth().phi == pytest.approx(wheel.state.phi, abs=0.05)  # it stopped soon
@@ -67,7 +67,7 @@ def test_the_fish_swims_on_with_an_unread_sensor(pi: VirtualPi, clock: VirtualCl
     assert pi.state().truth.alpha == 0.0
     clock.now += 10.0
     state = pi.state()
-    assert (state.pulse, state.angle) == (1740.0, pytest.approx(AMPLITUDE))
+    assert (state.pulse, state.phi_c) == (1740.0, pytest.approx(AMPLITUDE))
     assert state.truth.phi == pytest.approx(AMPLITUDE)
     assert state.truth.alpha == pytest.approx(PlantParameters().coupling * AMPLITUDE)
 

@@ -7,7 +7,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fishd.virtual.plant.base import REST, PlantState
-from fishd.virtual.plant.held import HeldWindowMatrices, HeldWindows
 from fishd.virtual.plant.parameters import MotorSettings, PlantParameters
 from fishd.virtual.plant.tethered import AnyWindow, FinWindow, TetheredFish
 
@@ -230,31 +229,6 @@ def test_an_instruction_that_is_held_gives_what_single_windows_give() -> None:
                 [*means(expected), expected.power, expected.fin_peak], rel=1e-11, abs=1e-15
             )
         held.state = single.state = PlantState(0.1, number * 0.01, 1.0)
-
-
-def test_windows_that_are_prepared_between_ticks_are_the_same_and_cost_the_tick_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    computed: list[float] = []
-    swim = HeldWindowMatrices.swim
-
-    def count_call(
-        self: HeldWindowMatrices, state: PlantState, target: float, lag: float
-    ) -> HeldWindows:
-        computed.append(target)
-        return swim(self, state, target, lag)
-
-    monkeypatch.setattr(HeldWindowMatrices, "swim", count_call)
-    prepared, plain = TetheredFish(PlantParameters()), TetheredFish(PlantParameters())
-    for tick in range(100):
-        request = (0.4 if tick // 6 % 2 else -0.3, 0.05, 10)
-        prepared.prepare(*request)
-        before = len(computed)
-        window = prepared.advance(*request)
-        assert len(computed) == before
-        assert means(window) == means(plain.advance(*request))
-        assert prepared.state == plain.state
-    assert computed
 
 
 def test_an_instruction_far_beyond_the_servo_lag_does_not_overflow() -> None:

@@ -19,7 +19,7 @@ def track(seconds: float, speed: Array | float = 0.1, **columns: float) -> dict[
     phase = np.arange(ticks) % round(PERIOD / TICK)
     track_columns = {name: np.full(ticks, columns.get(name, 0.0)) for name in COLUMNS}
     x = -np.cumsum(np.broadcast_to(speed, ticks)) * TICK
-    beat = {"time": time, "x": x, "command": np.where(phase < 20, -0.42, 0.42)}
+    beat = {"time": time, "x": x, "phi_c": np.where(phase < 20, -0.42, 0.42)}
     tail = 0.012 * np.cos(2 * np.pi * phase / 40)
     return track_columns | beat | {"tail_lowest": tail, "tail_highest": tail}
 
@@ -42,10 +42,10 @@ def test_a_ripple_within_the_beat_is_no_uncertainty() -> None:
 
 
 def test_a_fish_that_does_not_beat_or_get_on_has_no_efficiency() -> None:
-    for still in (gait(track(2.0) | {"command": np.zeros(200)}, SETTINGS),
+    for still in (gait(track(2.0) | {"phi_c": np.zeros(200)}, SETTINGS),
                   gait(track(2.0, -0.01), SETTINGS)):  # fmt: skip
         assert still.strouhal is still.froude_efficiency is still.cost_of_transport is None
-    assert gait(track(2.0) | {"command": np.zeros(200)}, SETTINGS).beats == 0
+    assert gait(track(2.0) | {"phi_c": np.zeros(200)}, SETTINGS).beats == 0
 
 
 def rising(by: float, seconds: float = 20.0) -> Array:
@@ -56,10 +56,8 @@ def rising(by: float, seconds: float = 20.0) -> Array:
 def test_a_fish_that_still_speeds_up_is_said_to_and_the_interval_widens_too_little() -> None:
     result = gait(track(20.0, rising(0.01)), SETTINGS)
     assert result.speed_trend == pytest.approx(0.01 / 1.1, rel=0.02)
-    assert result.speed_ci95
     assert result.speed_ci95 < 0.12 - result.speed
     slower = gait(track(20.0, rising(-0.01)), SETTINGS)
-    assert slower.speed_trend
     assert slower.speed_trend < 0.0
 
 
@@ -84,6 +82,5 @@ def test_the_interval_covers_the_mean_although_beats_are_alike() -> None:
         for index in range(1, 3000):  # correlated over 0.5 s
             wander[index] = 0.98 * wander[index - 1] + noise[index]
         result = gait(track(30.0, 0.1 + 0.002 * wander), SETTINGS)
-        assert result.speed_ci95
         held += abs(result.speed - 0.1) <= result.speed_ci95
     assert 180 <= held <= 199

@@ -43,18 +43,13 @@ def swimmer(
     return Immersed(flow, 1000.0, beam)
 
 
-def beam_of(body: Immersed) -> Beam:
-    assert body.beam
-    return body.beam
-
-
 def bend(body: Immersed, curvature: float) -> Array:
-    return beam_of(body).drive(lambda X: np.full_like(X, curvature))
+    return body.beam.drive(lambda X: np.full_like(X, curvature))
 
 
 def momentum(body: Immersed) -> float:
     """Return the momentum along x of the water and of the body's excess mass [kg m/s per metre]."""
-    excess = float(beam_of(body).excess[:, 0] @ body.velocity[:, 0])
+    excess = float(body.beam.excess[:, 0] @ body.velocity[:, 0])
     return body.density * body.flow.momentum() + excess
 
 
@@ -80,7 +75,7 @@ def compute_bend(steps: int) -> float:
     forces = bend(body, 10.0)
     for _ in range(steps):
         body.step(0.1 / steps, forces)
-    return float(beam_of(body).q[-1] - beam_of(body).q[2])
+    return float(body.beam.q[-1] - body.beam.q[2])
 
 
 def test_it_bends_as_far_however_short_the_steps() -> None:
@@ -102,7 +97,7 @@ def test_a_light_body_is_as_stable_as_a_heavy_one(excess: float) -> None:
 
 def test_a_loose_body_drifts_with_the_stream() -> None:
     body = swimmer(stream=0.1)
-    beam_of(body).rate[0] = 0.1
+    body.beam.rate[0] = 0.1
     body.flow.grid_velocity[0] = 0.1
     body.flow.inlet[:] = 0.1
     for _ in range(50):
@@ -115,8 +110,8 @@ def test_a_clamped_root_stays_where_it_is() -> None:
     forces = bend(body, 5.0)
     for _ in range(20):
         body.step(4e-3, forces)
-    assert beam_of(body).q[:3] == pytest.approx([0.1, 0.06, 0.0])
-    assert beam_of(body).q[-1] != 0.0
+    assert body.beam.q[:3] == pytest.approx([0.1, 0.06, 0.0])
+    assert body.beam.q[-1] != 0.0
 
 
 def circle_in_stream(steps: int) -> tuple[Immersed, float]:
@@ -151,7 +146,7 @@ def test_the_drag_of_a_circle_does_not_depend_on_the_step() -> None:
 )
 def test_a_body_that_leaves_is_told(place: tuple[float, float], message: str) -> None:
     body = swimmer()
-    beam_of(body).q[:2] = place
+    body.beam.q[:2] = place
     with pytest.raises(LeftTheGrid, match=message):
         body.step(1e-3)
 

@@ -5,14 +5,13 @@ from collections.abc import Callable
 from msgspec import Struct
 from msgspec.structs import replace
 
-from fishd.assembly import build_loop, simulated_fish
 from fishd.camera.simulated import SimulatedCameraSettings, SimulatedSight
 from fishd.config import Config, Start, check_tethered
 from fishd.controllers.base import Controller
 from fishd.core.camera_frames import Stack, StackSettings
-from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.core.signals import Observation, Truth
-from fishd.lab.links.link import LinkLost, StepResult
+from fishd.lab.simulation import VirtualRun
+from fishd.learning.links.link import LinkLost, StepResult
 
 
 class _NoParameters(Struct, frozen=True, forbid_unknown_fields=True):
@@ -45,35 +44,8 @@ class Camera(Struct, frozen=True):
         return SimulatedSight(self.settings, self.stack, tick, truth)
 
 
-class _LoopOnFish:
-    """The loop of a new simulated fish, which waits between the two halves of a tick."""
-
-    def __init__(
-        self,
-        config: Config,
-        decide: Callable[[Observation], float],
-        camera: Camera | None,
-        *,
-        metered: bool,
-    ) -> None:
-        """decide: returns the instruction angle for an observation [rad]; called once a tick"""
-        clock = VirtualClock()
-        fish = simulated_fish(config)
-        self.loop = build_loop(config, fish.robot(metered=metered), clock, None)
-        self.loop.set_controller("agent", FunctionController(config, decide))
-        self.truth = fish.truth
-        self.sight = camera.make_sight(fish.truth, config.tick) if camera else None
-        self._slots = virtual_slots(clock, config.tick)
-        self.turn = self.loop.observe(next(self._slots))
-
-    def tick(self) -> None:
-        """Run the second half of this tick and the first half of the next one."""
-        self.loop.act(self.turn)
-        self.turn = self.loop.observe(next(self._slots))
-
-
 class SimulatedLink:
-    """The link to a `ControlLoop` on a `SimulatedFish` in the same process.
+    """The link to a `VirtualRun` in this process.
 
     Each tick of the loop is split: the agent decides between its two halves, while virtual time
     stands still.
@@ -105,46 +77,52 @@ class SimulatedLink:
         self._camera = camera
         self._metered = metered
         self._angle = 0.0
-        self._fish: _LoopOnFish | None = None
+        self._run: VirtualRun | None = None
+        self._sight: SimulatedSight | None = None
 
     def reset(self, seed: int = 0, new: bool = False) -> Observation:
         """Start a new fish at rest if requested, drawn or the first; else let it swim on."""
-        if self._fish is None or new or self._draw:
+        if self._run is None or new or self._draw:
             self.config = self._draw(self._nominal, seed) if self._draw else self._nominal
-            self._fish = _LoopOnFish(
-                self.config, lambda _: self._angle, self._camera, metered=self._metered
-            )
+            self._run = run = VirtualRun(self.config, None, metered=self._metered)
+            controller = FunctionController(self.config, lambda _: self._angle)
+            run.loop.set_controller("agent", controller)
+            if self._camera:
+                self._sight = self._camera.make_sight(self.truth, self.tick)
+            self._turn = run.loop.observe(run.next_slot())
         return self.resume()
 
     def step(self, angle: float) -> StepResult:
         """Apply an angle [rad], and return the result one tick later."""
-        fish = self._swimming()
+        run = self._swimming()
         self._angle = angle
-        fish.tick()
-        supervisor = fish.loop.supervisor
+        run.loop.act(self._turn)
+        self._turn = run.loop.observe(run.next_slot())
+        supervisor = run.loop.supervisor
         if supervisor.reason:
             raise LinkLost(f"the loop is in {supervisor.mode}: {supervisor.reason.message}")
-        return StepResult(fish.turn.observation, power=fish.turn.power)
+        return StepResult(self._turn.observation)
 
     def look(self) -> Stack | None:
         """Return the frames of the simulated camera; None without a camera."""
-        fish = self._swimming()
-        return fish.sight.look(fish.turn.observation.time) if fish.sight else None
+        return self._sight.look(self._turn.observation.time) if self._sight else None
 
     def truth(self) -> Truth:
         """Return the true state of the fish at this tick."""
-        return self._swimming().truth()
+        truth = self._swimming().loop.robot.truth
+        assert truth
+        return truth()
 
     def pause(self, seconds: float) -> None:
         """Do nothing: virtual time stands still while the agent learns."""
 
     def resume(self) -> Observation:
         """Return the latest observation."""
-        return self._swimming().turn.observation
+        return self._turn.observation
 
     def close(self) -> None:
         """Do nothing: this link holds no resources."""
 
-    def _swimming(self) -> _LoopOnFish:
-        assert self._fish
-        return self._fish
+    def _swimming(self) -> VirtualRun:
+        assert self._run
+        return self._run

@@ -6,21 +6,19 @@ those assume a certain shunt. The settings of the averages are lost when the chi
 so they are read back at intervals.
 """
 
-import contextlib
 import errno
 import math
-import os
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, TypeVar
 
 from msgspec import Meta
 
-from fishd.core.clock import Clock, SystemClock
-from fishd.core.errors import StartupError
-from fishd.core.schema import note, unit
-from fishd.hardware import i2c
-from fishd.hardware.checks import START_VIRTUAL_PI, Check, Machine, Result, fail, ok, warning
-from fishd.hardware.driver import Claim, PowerMeterDriver, PowerMeterSettings, PowerSample
+from fishd.core.clock import Clock
+from fishd.core.schema import Reading, note, unit
+from fishd.hardware.checks import Result, ok, warning
+from fishd.hardware.sensors.i2c_sensor import I2cSensor, I2cSensorSettings
+from fishd.hardware.settings import POWER
 
 CLOCK_TOLERANCE = 1.15
 """Tolerance of the chips' clocks and of this machine's, as a factor."""
@@ -47,10 +45,9 @@ Shunt = Annotated[
 ]
 
 
-class InaSettings(PowerMeterSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class InaSettings(I2cSensorSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Address of the chip, and its shunt."""
 
-    bus: Annotated[i2c.Bus, note("I2C bus: N of /dev/i2c-N.")] = 1
     address: Annotated[
         Annotated[int, Meta(ge=0x40, le=0x4F)],
         note("I2C address, set by the pins A0 and A1; 64 is 0x40."),
@@ -61,41 +58,30 @@ class InaSettings(PowerMeterSettings, frozen=True, forbid_unknown_fields=True, k
 N = TypeVar("N", bound=InaSettings)
 
 
-class Ina(PowerMeterDriver[N]):
+class Ina(I2cSensor[N]):
     """An INA219 or INA226 on the I2C bus."""
 
+    readings: ClassVar[Mapping[str, Reading]] = {"power": POWER}
+    samples_per_tick = 4
     on_virtual_pi = True
-    transport = "i2c_power"
-    chip: ClassVar[str]
-    """Name of the chip."""
     full_scale: ClassVar[float]
     """Largest voltage over the shunt that the chip measures, ± [V]."""
     shunt_step: ClassVar[float]
     """Step of the voltage over the shunt [V]."""
     supply_step: ClassVar[float]
     """Step of the supply voltage [V]."""
-    _bus: Any = None
-    _trusted_until = -math.inf
+    _trusted_until = _measured_at = -math.inf
 
     @property
     def min_measuring_time(self) -> float:
         """Shortest time to measure for one value, so that every value is read at least once [s]."""
-        return CLOCK_TOLERANCE * self.interval
-
-    @property
-    def place(self) -> str:
-        """Chip, address and bus, for messages."""
-        return f"the {self.chip} at {self.settings.address:#04x} on /dev/i2c-{self.settings.bus}"
+        return CLOCK_TOLERANCE * self.period
 
     def open(self) -> None:
-        """Open the bus, find the chip and set it up; raise OSError if that fails."""
-        bus = i2c.open_bus(self.settings.bus)
-        try:
-            self.set_up(bus)
-        except BaseException:
-            i2c.close_bus(bus)
-            raise
-        self._bus = bus
+        """Open the bus and set the chip up; raise OSError if that fails."""
+        super().open()
+        # Until then, its registers have zeros, or what it measured with other settings.
+        self._measured_at = self.clock.monotonic() + 2.0 * self.min_measuring_time
 
     @abstractmethod
     def set_up(self, bus: Any) -> None:
@@ -109,12 +95,15 @@ class Ina(PowerMeterDriver[N]):
     def volts(self) -> tuple[float, float]:
         """Return the voltage of the supply and that over the shunt [V]; raise OSError."""
 
-    def sample(self) -> PowerSample:
-        """Read two registers.
+    def sample(self) -> dict[str, float] | None:
+        """Read two registers; return None until the chip has measured once.
 
-        Raises OSError if a transfer fails, and after a reset of the chip until it is opened again.
+        Raises OSError if a transfer fails, after a reset of the chip until it is opened again, and
+        at the end of the range.
         """
         now = self.clock.monotonic()
+        if now < self._measured_at:
+            return None
         # If this method raises, the settings are checked in the next call.
         trusted_until, self._trusted_until = self._trusted_until, -math.inf
         if now >= trusted_until:
@@ -126,56 +115,19 @@ class Ina(PowerMeterDriver[N]):
         supply, shunt = self.volts()
         self._trusted_until = trusted_until
         current = shunt / self.settings.shunt
-        clipped = ""
         if abs(shunt) >= self.full_scale:
             largest = self.full_scale / self.settings.shunt
-            clipped = f"the {self.chip} ends at {largest:.3g} A with a shunt of "
-            clipped += f"{self.settings.shunt:g} Ω: a smaller one is needed"
-        return PowerSample(self.clock.monotonic(), supply * current, clipped)
-
-    def close(self) -> None:
-        """Close the bus; never raises, may be called twice. The chip continues to measure."""
-        bus, self._bus = self._bus, None
-        if bus is not None:
-            i2c.close_bus(bus)
-
-    def explain(self, error: Exception) -> str:
-        """Return one line that says what went wrong and what to check."""
-        settings = self.settings
-        return i2c.explain(error, settings.bus, settings.address, self.chip, "power_meter")
-
-    @classmethod
-    def claims(cls, settings: N) -> tuple[Claim, ...]:
-        """Return the claim of the bus, which other drivers of the same fishd may use too."""
-        return (i2c.claim(settings.bus),)
-
-    @classmethod
-    def checks(cls, settings: N) -> tuple[Check, ...]:
-        """Return the check that the meter answers, which shows what it measures now."""
-        return (Check("power meter", lambda machine: cls._check(machine, settings)),)
-
-    @classmethod
-    def _check(cls, machine: Machine, settings: N) -> Result:
-        from fishd.hardware.registry import driver_packages
-
-        if occupied := machine.occupied("reads it: see power in fishctl status"):
-            return occupied
-        with driver_packages(settings.driver):
-            meter = cls(settings, SystemClock(), 0.01)
-        try:
-            with machine.plugged_in(), contextlib.closing(meter):
-                meter.open()
-                meter.clock.sleep(2.0 * meter.interval)
-                supply, shunt = meter.volts()
-        except StartupError as error:
-            return fail(str(error), START_VIRTUAL_PI)
-        except (OSError, ValueError) as error:
-            return fail(
-                meter.explain(error),
-                f"'i2cdetect -y {settings.bus}' (package i2c-tools) lists which addresses answer",
+            raise OSError(
+                f"the {self.chip} ends at {largest:.3g} A with a shunt of "
+                f"{self.settings.shunt:g} Ω: a smaller one is needed"
             )
-        amps = shunt / settings.shunt
-        reading = f"{supply:.2f} V, {amps * 1e3:.0f} mA at {meter.place}"
+        return {"power": supply * current}
+
+    def judge(self, values: Mapping[str, float]) -> Result:
+        """Do as `SensorDriver.judge`, with voltage and current."""
+        supply, shunt = self.volts()
+        amps = shunt / self.settings.shunt
+        reading = f"{supply:.2f} V, {amps * 1e3:.0f} mA at {self.place}"
         if supply < MIN_SUPPLY_V:
             return warning(
                 f"{reading}: no supply of a servo is behind the shunt",
@@ -183,7 +135,7 @@ class Ina(PowerMeterDriver[N]):
             )
         if amps < -5e-3:
             return warning(f"{reading}: the current is negative", "swap VIN+ and VIN-")
-        return ok(f"{reading}; up to {meter.full_scale / settings.shunt:.3g} A")
+        return ok(f"{reading}; up to {self.full_scale / self.settings.shunt:.3g} A")
 
 
 class Ina219Settings(InaSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -194,28 +146,22 @@ class Ina219(Ina[Ina219Settings]):
     """An INA219 on the I2C bus; up to 3.2 A with a shunt of 0.1 Ω."""
 
     Settings = Ina219Settings
-    packages = ("adafruit-blinka", "adafruit-circuitpython-ina219", "adafruit-extended-bus")
+    packages = (*I2cSensor.packages, "adafruit-circuitpython-ina219")
     chip = "INA219"
     full_scale = 0.32
     shunt_step, supply_step = 10e-6, 4e-3
     _chip: Any
 
-    def __init__(self, settings: Ina219Settings, clock: Clock, interval: float) -> None:
+    def __init__(self, settings: Ina219Settings, clock: Clock, period: float, section: str) -> None:
         """Import the library; raise ImportError if it is not installed."""
         from adafruit_ina219 import INA219
 
-        super().__init__(settings, clock, interval)
+        super().__init__(settings, clock, period, section)
         self._library = INA219
 
     def set_up(self, bus: Any) -> None:
         """Set up the chip as the library does, but average the shunt's voltage without gaps."""
-        try:
-            self._chip = self._library(bus, self.settings.address)
-        except ValueError as error:  # raised by the library if nothing answers
-            number = getattr(error.__context__, "errno", None)
-            if number is None:
-                raise
-            raise OSError(number, os.strerror(number)) from None
+        self._chip = self._library(bus, self.settings.address)
         doublings = 1
         while (
             doublings < 7 and (2**doublings + 1) * CONVERSION_TIME_219_S < self.min_measuring_time
@@ -247,7 +193,6 @@ class Ina226(Ina[Ina226Settings]):
     """
 
     Settings = Ina226Settings
-    packages = ("adafruit-blinka", "adafruit-extended-bus")
     chip = "INA226"
     full_scale = 0.0819
     shunt_step, supply_step = 2.5e-6, 1.25e-3

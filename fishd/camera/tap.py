@@ -7,9 +7,8 @@ from fishd.camera.client import CameraClient
 from fishd.camera.messages import FrameHeader
 from fishd.client import Fish
 from fishd.core import text
-from fishd.core.camera_frames import Frame, Pixels
+from fishd.core.camera_frames import Frame, FrameHead, Pixels
 from fishd.core.errors import FishError
-from fishd.recording.images import FrameHead
 
 CAMERA_TIMEOUT_S = 2.0
 """Time without a frame after which the camera counts as lost [s]."""

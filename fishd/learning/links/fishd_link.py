@@ -16,7 +16,7 @@ from fishd.core.agent_messages import Observed
 from fishd.core.camera_frames import Stack, StackSettings
 from fishd.core.errors import FishError, LeaseLost, NoDaemon, PolicyError, Refused
 from fishd.core.signals import Observation, Reason, Status
-from fishd.lab.links.link import LinkLost, StepResult
+from fishd.learning.links.link import LinkLost, StepResult
 
 OBSERVATION_TIMEOUT_S = 10.0
 """Time without an observation after which control counts as lost [s]."""

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fishd.camera.simulated import Tail
-from fishd.camera.sources.simulated import FishDescription, Foresight, TickTruth
+from fishd.camera.sources.simulated import FishDescription, MotionPrediction, TickTruth
 from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
@@ -42,8 +42,8 @@ class Swim:
         return TickTruth(self._seq, self.command, not released, now, **state)
 
 
-def foresight(plant: PlantParameters, **options: Any) -> Foresight:
-    return Foresight(FishDescription(TICK, plant, 200.0, options.get("lockstep", True)))
+def predict(plant: PlantParameters, **options: Any) -> MotionPrediction:
+    return MotionPrediction(FishDescription(TICK, plant, 200.0, options.get("lockstep", True)))
 
 
 @settings(max_examples=20)
@@ -57,7 +57,7 @@ def test_the_next_tick_is_known_to_the_last_bit(
     seed: int, delay: float, backlash: float, slack: float
 ) -> None:
     plant = PlantParameters(servo_delay=delay, backlash=backlash, cable_slack=slack)
-    swim, ahead = Swim(plant, seed), foresight(plant)
+    swim, ahead = Swim(plant, seed), predict(plant)
     believed = Tail(0.0, 0.0, 0.0)
     for number in range(40):
         tick = swim.tick(released=number in (20, 21))
@@ -70,7 +70,7 @@ def test_the_next_tick_is_known_to_the_last_bit(
 
 
 def test_slots_that_fishd_skips_leave_no_hole() -> None:
-    swim, ahead = Swim(PlantParameters(), 1), foresight(PlantParameters(), lockstep=False)
+    swim, ahead = Swim(PlantParameters(), 1), predict(PlantParameters(), lockstep=False)
     course = []
     for slots in (1, 1, 3, 1, 2, 1):
         course += ahead.follow(swim.tick(slots))
@@ -81,7 +81,7 @@ def test_slots_that_fishd_skips_leave_no_hole() -> None:
 
 def test_after_ticks_that_nobody_heard_it_begins_anew_from_the_true_state() -> None:
     plant = PlantParameters(servo_delay=0.08)
-    swim, ahead = Swim(plant, 2), foresight(plant)
+    swim, ahead = Swim(plant, 2), predict(plant)
     ahead.follow(swim.tick())
     for _ in range(5):
         swim.tick()

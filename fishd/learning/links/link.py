@@ -21,8 +21,6 @@ class StepResult(NamedTuple):
     observation: Observation
     lost: int = 0
     """Number of ticks since the previous observation with another angle than the action."""
-    power: float | None = None
-    """Mean electrical power of the servo since the previous observation [W]; None if unknown."""
 
 
 class Link(Protocol):

@@ -1,1 +1,0 @@
-"""Power meters: the electrical power that the servo takes from its supply."""

@@ -1,0 +1,1 @@
+"""Sensors besides the force sensor; each declares its readings, which every consumer shows."""
