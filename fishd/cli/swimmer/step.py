@@ -9,7 +9,6 @@ from fishd.cli.options import FiniteRange, json_option
 from fishd.cli.output import echo_rows, print_json
 from fishd.config import load
 from fishd.core.errors import ParameterError
-from fishd.lab.swimmer.step_response import MAX_XI, fit, swim_step
 
 
 @click.command()
@@ -30,6 +29,8 @@ def step(
     paper's oscillator, α̈ + ξω₀α̇ + ω₀²(α − α_c) = 0, fitted to the angle of the tail. Its misfit
     is relative to α_c.
     """
+    from fishd.lab.swimmer.step_response import MAX_XI, fit, swim_step
+
     config = load(file, overrides)
     if config.kind.is_tethered:
         raise ParameterError(
