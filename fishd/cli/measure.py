@@ -39,10 +39,10 @@ def measure() -> None:
 def _measure(
     name: str, parameters: dict[str, Any], seconds: float, settle: float, run: Run
 ) -> None:
+    from fishd.core.swim_plan import plan
     from fishd.lab import measurement, measurement_figure
     from fishd.lab.error_budget import warn_of_unknown_calibration
     from fishd.lab.session import LiveSession
-    from fishd.lab.swim_plan import plan
 
     plan(seconds, parameters, settle)  # before the experiment has a folder
     session = run.session()

@@ -118,10 +118,10 @@ def _optimise(
     target_thrust: float | None,
     run: Run,
 ) -> int:
+    from fishd.core.swim_plan import MEAN_REST_S
     from fishd.lab.optimise.choice import Choice
     from fishd.lab.optimise.result import make_optimum
     from fishd.lab.optimise.trials import Aim, TrialTable, measure_trials, trial_durations
-    from fishd.lab.swim_plan import MEAN_REST_S
 
     if objective and target_thrust:
         raise click.UsageError(

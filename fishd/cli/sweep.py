@@ -156,9 +156,9 @@ def _swim(
 
 def _measure(run: Run, points: "list[Point]", seconds: float) -> "SweepFolder":
     """Measure a live fish, each point for `seconds`, and return the results."""
+    from fishd.core.swim_plan import plan
     from fishd.lab.sweep import grid
     from fishd.lab.sweep.measuring import measure_all
-    from fishd.lab.swim_plan import plan
 
     for point in points:
         plan(seconds, point.parameters)  # raises for too short a time before the fish moves

@@ -13,12 +13,12 @@ from fishd.core.beats import upward_reversals
 from fishd.core.errors import ParameterError
 from fishd.core.estimation import PIECE_S, REST_SETTLE_TIME_S, SWIM_SETTLE_TIME_S
 from fishd.core.signals import Tick, reading_of
+from fishd.core.swim_plan import plan, rest_settle_time
 from fishd.lab.disturbances import RESPONSE_TIMES_S, Disturbance
 from fishd.lab.drift import MIN_FIT_BLOCKS, Array, Blocks, fit
 from fishd.lab.error_budget import Thrust, lateral_force, thrust_fields, visible_rotation
 from fishd.lab.session import Session, refuse_lost
 from fishd.lab.statistics import Z95
-from fishd.lab.swim_plan import plan, rest_settle_time
 
 MAX_POWER_CHANGE, MAX_REST_POWER = 0.05, 0.01
 """Largest change of the fin's power within a swim, and largest decay of it within a rest, as

@@ -10,7 +10,7 @@ from msgspec import Struct
 from fishd.core import text
 from fishd.core.errors import ParameterError
 from fishd.core.signals import ControllerInfo
-from fishd.lab.swim_plan import plan
+from fishd.core.swim_plan import plan
 from fishd.window.access import AccessControl
 from fishd.window.answers import ApiError, NoArguments, convert, read_body, success
 from fishd.window.fish_link import Busy

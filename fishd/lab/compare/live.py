@@ -9,13 +9,13 @@ from msgspec.structs import replace
 
 from fishd.core.errors import FishdError
 from fishd.core.signals import Tick
+from fishd.core.swim_plan import plan
 from fishd.lab.compare.comparison import Standing, Trace, trace
 from fishd.lab.compare.contestants import Contestant, parse
 from fishd.lab.error_budget import thrust_fields
 from fishd.lab.measurement import ThrustMeasurement, measure
 from fishd.lab.session import Session, concerns_one_controller
 from fishd.lab.statistics import weighted_mean
-from fishd.lab.swim_plan import plan
 
 
 class LiveComparison:

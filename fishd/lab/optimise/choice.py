@@ -4,10 +4,10 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from fishd.core.swim_plan import MEAN_REST_S
 from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Proposal, Search
 from fishd.lab.optimise.trials import Aim, Candidate, Trial
-from fishd.lab.swim_plan import MEAN_REST_S
 
 MAX_FINALS = 3
 """Largest number of measurements of a best candidate, if each moves the best to another place."""

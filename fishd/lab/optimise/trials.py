@@ -13,6 +13,7 @@ from fishd.core.errors import ConfigError, ParameterError
 from fishd.core.estimation import SWIM_SETTLE_TIME_S
 from fishd.core.schema import Field, format_permitted, is_valid_number
 from fishd.core.signals import Tick
+from fishd.core.swim_plan import MEAN_REST_S, MEAN_SWIM_S
 from fishd.lab.error_budget import visible_rotation
 from fishd.lab.experiment import Experiment
 from fishd.lab.measurement import Step, evaluate, to_samples
@@ -20,7 +21,6 @@ from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.session import Session, refuse_lost
 from fishd.lab.statistics import per_watt
-from fishd.lab.swim_plan import MEAN_REST_S, MEAN_SWIM_S
 
 MIN_STEADY_S = 3.0
 """Shortest measured time of each candidate, after it has settled [s]."""

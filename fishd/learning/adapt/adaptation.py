@@ -12,6 +12,7 @@ from msgspec.structs import replace
 from fishd.config import Config, Start
 from fishd.core import text
 from fishd.core.errors import FishdError
+from fishd.core.swim_plan import MEAN_REST_S
 from fishd.lab.compare.comparison import Standing
 from fishd.lab.compare.contestants import Contestant
 from fishd.lab.compare.figures import draw as draw_gaits
@@ -23,7 +24,6 @@ from fishd.lab.identification.figure import draw as draw_fit
 from fishd.lab.optimise.figure import draw as draw_search
 from fishd.lab.session import Session
 from fishd.lab.simulation import simulate
-from fishd.lab.swim_plan import MEAN_REST_S
 from fishd.learning.adapt import steps
 from fishd.learning.adapt.results import (
     FISH,

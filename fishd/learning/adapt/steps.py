@@ -17,6 +17,8 @@ from msgspec.structs import replace
 
 from fishd.config import Config, ServoSettings, Start
 from fishd.core.errors import FishdError, ParameterError, PolicyError
+from fishd.core.swim_plan import MEAN_REST_S
+from fishd.core.swim_plan import plan as plan_of
 from fishd.lab.compare.contestants import Contestant
 from fishd.lab.identification import DEFAULT, Identification, Unidentifiable, identify
 from fishd.lab.identification.fit import BOUNDS, LOGARITHMIC
@@ -29,8 +31,6 @@ from fishd.lab.optimise.trials import (
     trial_durations,
 )
 from fishd.lab.session import Session
-from fishd.lab.swim_plan import MEAN_REST_S
-from fishd.lab.swim_plan import plan as plan_of
 from fishd.learning.adapt.prior import (
     combine,
     correlation_of_waves,
