@@ -432,7 +432,7 @@ def build_estimator(config: Config) -> Estimator:
     """Return the estimator that `estimator.kind` names."""
     if config.estimator.kind == "observer":
         return Observer(config.estimator, config.plant, config.tick)
-    if config.estimator.kind == "sensor":
+    if config.estimator.kind in ("sensor", "tail"):
         return FinSensor()
     return LateralForceEstimator(config.estimator)
 

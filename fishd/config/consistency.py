@@ -204,12 +204,12 @@ def check_estimator(robot: str, kind: str, plant: PlantParameters) -> None:
         raise Problem(
             ("estimator", "kind"),
             f"observer is not valid with robot: {robot}, since its model is of a tethered fish; "
-            "sensor or lateral_force is needed",
+            "tail, sensor or lateral_force is needed",
         )
-    if kind == "sensor" and find_kind(robot).is_tethered:
+    if kind in ("sensor", "tail") and find_kind(robot).is_tethered:
         raise Problem(
             ("estimator", "kind"),
-            f"sensor is not valid with robot: {robot}, which has no fin sensor; "
+            f"{kind} is not valid with robot: {robot}, which has no fin sensor; "
             "lateral_force or observer is needed",
         )
     if kind == "observer" and robot == "pi" and plant == PlantParameters():

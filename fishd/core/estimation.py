@@ -20,11 +20,12 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """Settings of the estimator of fin velocity and thrust."""
 
     kind: Annotated[
-        Literal["lateral_force", "observer", "sensor"],
+        Literal["lateral_force", "observer", "sensor", "tail"],
         note(
             "lateral_force integrates F_y; observer is a Kalman filter on the fish of section "
             "plant, as fishctl identify finds it; sensor takes the angular velocity of the tail "
-            "against the front body, which a free fish measures."
+            "against the front body, which a free fish measures; tail takes the velocity of its "
+            "tail across the laboratory, as the paper's swimmer does."
         ),
     ] = "lateral_force"
     leak: Annotated[

@@ -35,7 +35,7 @@ STEPS = {1.0: 0.5, 0.5: 0.4, 0.25: 0.2}
 """Time step [ms] for each size of the cells [mm]."""
 NOT_STEADY = "never"
 """Text for a speed that still changed at the end."""
-CONFIG = Path(__file__).resolve().parents[2] / "config" / "swimmer.yaml"
+CONFIG = Path(__file__).resolve().parents[2] / "config" / "swimmer-undamped.yaml"
 
 
 class Case(NamedTuple):
@@ -104,7 +104,7 @@ TABLE = Table(NAME, 0.5, (1.0, 0.5, 0.25))
 
 
 def config(cell: float) -> Config:
-    """Return the default swimmer on such a grid; cell: size of the cells [mm]"""
+    """Return the undamped swimmer on such a grid; cell: size of the cells [mm]"""
     numerics = "swimmer.numerics."
     step = 1e-3 * STEPS[cell]
     return load(

@@ -6,6 +6,7 @@ from fishd.cli.verbs import Verb, Verbs
 
 VERBS = {
     "Measure": {
+        "step": Verb("swimmer.step", "step", "Measure natural frequency and damping in water."),
         "refine": Verb("swimmer.refine", "refine", "Estimate the error of its speed by the grid."),
     },
     "Draw": {

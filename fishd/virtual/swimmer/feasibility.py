@@ -37,6 +37,9 @@ MIN_THICKNESS_FRACTION = 0.05
 """Smallest thickness of the body without its ends, relative to the largest."""
 MAX_LEAD_LENGTHS = 0.05
 """Largest lead of an accelerating fish over the middle of the grid [body lengths]."""
+MIN_TAIL_DAMPING = 0.05
+"""Smallest damping ηω₀/E of the material with which the tip of the tail follows the body. With 0.01
+it flutters, swing by the velocity of the tail turns the fish, and it leaves its grid."""
 _TANK_MARGIN = 1.2
 """Smallest size of the tank relative to that of the part with small cells."""
 
@@ -111,6 +114,18 @@ def check(settings: SwimmerSettings) -> None:
             ("swimmer", "body"), "its stiffness and the water's density are too far apart"
         ) from None
     _check_step(settings, estimates.courant_number)
+
+
+def check_tail(settings: SwimmerSettings) -> None:
+    """Raise `Problem` if the velocity of the tail is that of a tip that flutters."""
+    body, omega = settings.body, 2.0 * math.pi * estimate(settings).frequency
+    if body.viscosity * omega / body.young < MIN_TAIL_DAMPING:
+        raise Problem(
+            ("estimator", "kind"),
+            f"tail is not valid with a swimmer.body.viscosity of {body.viscosity:g} Pa s: the tip "
+            f"of this tail flutters; {MIN_TAIL_DAMPING * body.young / omega:.2g} Pa s or more, or "
+            "sensor, is needed",
+        )
 
 
 def _check_profile(body: Body) -> None:

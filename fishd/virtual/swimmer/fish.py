@@ -18,6 +18,8 @@ tail refer to it."""
 REAR_FRACTION = 0.8
 """Begin of the rear body, as a fraction of the length. The angle of the tail is that of the middle
 of the rear body, because the thin tip flutters."""
+TAIL_FRACTION = 0.98
+"""Place of the velocity of the tail, as a fraction of the length."""
 FOLLOW_TIME = 0.05
 """Time constant with which the grid takes on the speed of the fish [s]."""
 RECENTRE_RATE = 2.0
@@ -63,6 +65,8 @@ class Motion(NamedTuple):
     """Rate of `tail_angle` [rad/s]."""
     tail_y: float
     """y of the tip of the tail in the laboratory [m]."""
+    tail_speed: float
+    """Velocity of the tail at `TAIL_FRACTION` along y in the laboratory [m/s]."""
     thrust: float
     """Force of the water on the body along −x [N]."""
     side_force: float
@@ -126,6 +130,7 @@ class Fish:
         self._front /= self._front.sum()
         self._rear = self.beam.share * (REAR_FRACTION * body.length < self.beam.X)
         self._rear /= self._rear.sum()
+        self._tail = int(np.abs(self.beam.X - TAIL_FRACTION * body.length).argmin())
 
     @property
     def time(self) -> float:
@@ -247,6 +252,7 @@ class Fish:
             tail_rate=float(lateral_rate * forward - forward_rate * lateral)
             / (forward**2 + lateral**2),
             tail_y=float(self._travelled[1] + self.midline()[-1, 1]),
+            tail_speed=float(velocity[self._tail, 1]),
             thrust=-float(self._hydrodynamic[:, 0].sum()),
             side_force=float(self._hydrodynamic[:, 1].sum()),
         )

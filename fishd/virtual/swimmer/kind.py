@@ -34,6 +34,8 @@ class FreeSwimmer(RobotKind):
                 f"'{law}' is not possible with swimmer.muscle.servo, which follows tanh",
             )
         feasibility.check(settings)
+        if config.estimator.kind == "tail":
+            feasibility.check_tail(settings)
         tick, step = config.tick, settings.numerics.step
         steps = max(1, round(tick / step))
         if abs(tick / step - steps) > 1e-6:
@@ -63,6 +65,12 @@ class FreeSwimmer(RobotKind):
         except ModuleNotFoundError as error:
             package = (error.name or "").partition(".")[0]
             raise MissingPackage.of_extra("robot: swimmer", package, "swimmer") from None
-        fish = Swimmer(config.swimmer, config.plant, config.amplitude_limit, config.tick)
+        fish = Swimmer(
+            config.swimmer,
+            config.plant,
+            config.amplitude_limit,
+            config.tick,
+            senses_tail=config.estimator.kind == "tail",
+        )
         fish.compile()
         return fish

@@ -15,7 +15,14 @@ from fishd.hardware.base import Robot
 from fishd.virtual.plant.base import TrueWindow
 from fishd.virtual.plant.drive_train import relax
 from fishd.virtual.plant.parameters import PlantParameters
-from fishd.virtual.swimmer.fish import Diverged, Fish, Motion, Work
+from fishd.virtual.swimmer.fish import (
+    FRONT_FRACTION,
+    TAIL_FRACTION,
+    Diverged,
+    Fish,
+    Motion,
+    Work,
+)
 from fishd.virtual.swimmer.grid import Array
 from fishd.virtual.swimmer.settings import SwimmerSettings
 
@@ -37,13 +44,21 @@ class Swimmer:
     """Force sensor, tail sensor and muscles of a free swimmer."""
 
     def __init__(
-        self, settings: SwimmerSettings, plant: PlantParameters, amplitude: float, tick: float
+        self,
+        settings: SwimmerSettings,
+        plant: PlantParameters,
+        amplitude: float,
+        tick: float,
+        *,
+        senses_tail: bool = False,
     ) -> None:
         """settings: as accepted by `feasibility.check`
 
         plant: parameters of the servo, if the muscles follow one
         amplitude: Φ, the instruction angle of full activation [rad]
         tick: period of the loop, a whole number of steps; the first read covers one period [s]
+        senses_tail: whether the measured fin velocity is that of the tail across the laboratory,
+            over its distance to the middle of the front body, and not `Motion.tail_rate`
         """
         self.settings = settings
         self.fish = Fish(settings)
@@ -63,6 +78,8 @@ class Swimmer:
         self._instruction_angle: float | None = None
         self._phi = 0.0
         self._sensed_rate = 0.0
+        lever = (TAIL_FRACTION - 0.5 * FRONT_FRACTION) * settings.body.length
+        self._lever = lever if senses_tail else None
         smoothing = settings.sensor_time / settings.numerics.step
         self._share = -math.expm1(-1.0 / smoothing) if smoothing else 1.0
 
@@ -113,7 +130,8 @@ class Swimmer:
             self.trouble = error
             raise FishLost(str(error)) from error
         motion = self.fish.motion()
-        self._sensed_rate += self._share * (motion.tail_rate - self._sensed_rate)
+        rate = motion.tail_speed / self._lever if self._lever else motion.tail_rate
+        self._sensed_rate += self._share * (rate - self._sensed_rate)
         return motion
 
     def _activation(self) -> float:

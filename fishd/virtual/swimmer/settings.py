@@ -37,11 +37,20 @@ class Body(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             "[[0, 0], [0.3, 0.16], [1, 0]]; null: the paper's s = (X/L)(1 − X/L)exp(−X/L)."
         ),
     ] = None
-    young: Annotated[float, unit("Pa", "Young's modulus.", gt=0.0, le=1e12)] = 1e4
+    young: Annotated[
+        float,
+        unit(
+            "Pa",
+            "Young's modulus. With viscosity, it gives the robot's ω₀ and ξ, to which the paper "
+            "matches its body; the 1e4 and 1e-4 that it prints do not (fishctl swimmer step).",
+            gt=0.0,
+            le=1e12,
+        ),
+    ] = 8200.0
     poisson: Annotated[float, unit("1", "Poisson's ratio.", ge=0.0, lt=0.5)] = 0.3
     viscosity: Annotated[
         float, unit("Pa s", "Viscosity of the material (Kelvin–Voigt).", ge=0.0, le=1e9)
-    ] = 1e-4
+    ] = 720.0
     excess_density: Annotated[
         float, unit("kg/m^3", "Density of the body minus that of the water.", ge=0.0, le=2e4)
     ] = 0.0

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from rigs.coarse_swimmer import FILE, OPTIONS, coarse
+from rigs.coarse_swimmer import FILE, OPTIONS, UNDAMPED, coarse
 from rigs.processes import fishctl, one_line, sets
 
 from fishd.config import load
@@ -128,9 +128,11 @@ def test_a_fish_without_a_grid_cannot_be_refined() -> None:
     assert str(FILE.name) in line
 
 
-def test_the_error_of_the_square_wave_of_the_default_fish_is_shipped(
+def test_the_error_of_the_square_wave_of_the_undamped_fish_is_shipped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     wave = {"frequency": 3.0, "amplitude": None}
-    assert refinement.find_grid_error(load(FILE), "square", wave) == pytest.approx(0.079, abs=1e-3)
+    assert refinement.find_grid_error(load(UNDAMPED), "square", wave) == pytest.approx(
+        0.079, abs=1e-3
+    )

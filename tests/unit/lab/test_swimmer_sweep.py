@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from rigs.coarse_swimmer import FILE, OPTIONS, coarse
+from rigs.coarse_swimmer import FILE, OPTIONS, UNDAMPED, coarse
 from rigs.processes import fishctl, one_line
 
 from fishd.config import Config
@@ -24,7 +24,7 @@ WAVE = Point("square", {"frequency": 3.0})
 
 @pytest.fixture(scope="module")
 def config() -> Config:
-    return coarse()
+    return coarse(file=UNDAMPED)
 
 
 def beats(speeds: np.ndarray, period: float = 0.5) -> tuple[np.ndarray, np.ndarray]:

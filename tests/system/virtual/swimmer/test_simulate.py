@@ -68,7 +68,7 @@ def test_the_figures_agree_with_one_another(swum: tuple[dict[str, Any], Path]) -
 
 
 def test_a_person_gets_the_same_in_a_few_lines() -> None:
-    out = simulate("swing", "--seconds", "1.5", "--settle", "0.5").stdout
+    out = simulate("swing", "--seconds", "2.5", "--settle", "0.5").stdout
     for word in ("speed", "frequency", "heading", "tail", "power", "cost", "Strouhal", "Froude"):
         assert f"\n{word} " in out
     assert "whole beats" in out
@@ -196,7 +196,8 @@ def test_a_swim_that_is_not_steady_is_said_to_need_a_longer_settle() -> None:
 def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(tmp_path: Path) -> None:
     kept = tmp_path / "kept.npz"
     keeps = ("--to", str(kept), "--checkpoint-every", "0.1")
-    narrow = sets("swimmer.numerics.fine_width=0.5", "swimmer.steering=0")
+    body = ("swimmer.body.young=1e4", "swimmer.body.viscosity=1e-4", "estimator.kind=sensor")
+    narrow = sets("swimmer.numerics.fine_width=0.5", "swimmer.steering=0", *body)
     done = fishctl("simulate", "square", "--frequency", "1", *OPTIONS, *narrow, *keeps)
     line = one_line(done)
     assert done.returncode == 1

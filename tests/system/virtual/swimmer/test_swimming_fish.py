@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rigs.coarse_swimmer import coarse
+from rigs.coarse_swimmer import UNDAMPED, coarse
 
 from fishd.virtual.swimmer.fish import Fish, Work
 
@@ -29,7 +29,8 @@ def compute_friction(fish: Fish, speed: float) -> float:
 @pytest.mark.slow
 def test_a_fish_gives_the_water_what_its_muscles_give_and_friction_alone_slows_it() -> None:
     small_steps_and_tank = "numerics.step=0.001", "water.length=0.2", "water.width=0.15"
-    fish = Fish(coarse(*(f"swimmer.{setting}" for setting in small_steps_and_tank)).swimmer)
+    settings = (f"swimmer.{setting}" for setting in small_steps_and_tank)
+    fish = Fish(coarse(*settings, file=UNDAMPED).swimmer)
     swim(fish, 0.8, 2.5)
     for _ in range(3):
         before = np.array(fish.work)

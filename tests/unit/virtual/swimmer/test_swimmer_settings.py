@@ -35,7 +35,8 @@ def test_a_configuration_is_checked_without_loading_the_solver() -> None:
         ("swimmer.body.length=0.3", "swimmer.water.width: a tank of 0.2 m is too small"),
         ("swimmer.muscle.strain=8", "swimmer.muscle.strain: 8 folds the body"),
         ("estimator.kind=observer", "estimator.kind: observer is not valid with robot: swimmer"),
-        ("robot=simulated", "estimator.kind: sensor is not valid with robot: simulated"),
+        ("robot=simulated", "estimator.kind: tail is not valid with robot: simulated"),
+        ("swimmer.body.viscosity=8", "estimator.kind: tail is not valid with a swimmer.body.visc"),
         ("lockstep=true", "lockstep: true is not valid with robot: swimmer"),
     ],
 )  # fmt: skip
