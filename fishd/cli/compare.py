@@ -297,14 +297,15 @@ def _make_table(standings: "list[Standing]", unit: str) -> "Table":
     simulated = all(standing.runs for standing in standings)
     table = Table(box=None, pad_edge=False)
     table.add_column("contestant", overflow="fold")
-    heads = ["relative"] if simulated else []
+    has_best = all(standing.relative_thrust is not None for standing in standings)
+    heads = ["relative"] if has_best else []
     metered = all(standing.thrust_per_watt is not None for standing in standings)
     costs = ["W", f"m{unit}/W"] if metered else []
     parts = [] if simulated else ["statistical", "calibration"]
     for head in (*heads, f"m{unit}", *parts, *costs, "Hz", "|φ_c|/Φ", "square"):
         table.add_column(head, justify="right", no_wrap=True)
     for standing in standings:
-        cells = [f"{standing.relative_thrust:.1%}"] if simulated else []
+        cells = [f"{standing.relative_thrust:.1%}"] if has_best else []
         table.add_row(
             standing.contestant,
             *cells,
@@ -344,6 +345,7 @@ def _describe_best_square(standings: "list[Standing]") -> str | None:
         (run.best_square_thrust, run.best_square_frequency)
         for standing in standings
         for run in standing.runs
+        if standing.relative_thrust is not None
     }
     if len(best) != 1:
         return None

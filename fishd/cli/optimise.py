@@ -203,12 +203,13 @@ def _add_truth(optimum: "Optimum", fish: ChosenFish, fixed: dict[str, Any]) -> "
     """Return the result with the true values of a simulated fish."""
     from fishd.lab.simulation import simulate
 
-    truth = simulate(fish.load(), optimum.controller, {**fixed, **optimum.parameters})
+    config = fish.load()
+    truth = simulate(config, optimum.controller, {**fixed, **optimum.parameters})
     warn_of_fin(truth.fin_amplitude)
     return replace(
         optimum,
         true_thrust=truth.mean_thrust,
-        relative_thrust=truth.relative_thrust,
+        relative_thrust=truth.relative_thrust if config.kind.is_of_plant() else None,
         true_power=truth.mean_power,
     )
 
@@ -309,10 +310,9 @@ def _print_optimum(optimum: "Optimum", unit: str, units: dict[str, str], folder:
         echo(f"fishctl: no parameters are known that give {target}", err=True)
     if optimum.true_thrust is not None:
         power = "" if optimum.true_power is None else f" for {format_power(optimum.true_power)}"
-        echo(
-            f"true thrust there: {optimum.true_thrust * 1e3:.2f} mN{power}, "
-            f"{optimum.relative_thrust:.1%} of the best square wave"
-        )
+        relative_thrust = optimum.relative_thrust
+        share = f", {relative_thrust:.1%} of the best square wave" if relative_thrust else ""
+        echo(f"true thrust there: {optimum.true_thrust * 1e3:.2f} mN{power}{share}")
     waiting = ""
     if optimum.choice_time is not None:
         waiting = f"; {optimum.choice_time:.0f} s of waiting for candidates"

@@ -27,7 +27,6 @@ from fishd.cli.swimmer.simulation import (
 )
 from fishd.config import Config, load
 from fishd.core.console import format_power
-from fishd.core.robots import RobotKind
 
 if TYPE_CHECKING:
     from fishd.lab.simulation import Report, VirtualRun
@@ -104,7 +103,7 @@ def _simulate(
             return swim(run_arguments, free_swim, as_json)
         report = run(config, name, parameters, seconds, settle, writer, on_start)
     check_whole_beat(report, seconds, settle)
-    has_best = config.kind.open is RobotKind.open  # otherwise the fish is not that of section plant
+    has_best = config.kind.is_of_plant()
     if as_json:
         values = asdict(report)
         print_json({key: values[key] for key in values if has_best or key not in _OF_BEST_SQUARE})

@@ -38,6 +38,11 @@ class RobotKind:
     hides_from_camera: ClassVar[str | None] = None
     """Reason why the simulated camera cannot show the fish; None if it can."""
 
+    @classmethod
+    def is_of_plant(cls) -> bool:
+        """Return whether the fish is that of section `plant`, whose best square wave is known."""
+        return cls.open is RobotKind.open
+
     @staticmethod
     def check(config: Any) -> None:
         """Refuse a configuration that is valid key by key, but not with this robot.

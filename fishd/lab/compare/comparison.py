@@ -67,7 +67,7 @@ class Standing(Thrust, frozen=True, kw_only=True):
     thrusts: list[float]
     """Thrust of each run [N]."""
     relative_thrust: float | None = None
-    """Thrust over that of the best square wave; None for a real fish."""
+    """Thrust over that of the best square wave; None if that is unknown, as for a real fish."""
     faults: list[str] = field(default_factory=list)
     """Reasons of runs that ended in mode fault."""
     fallbacks: list[str] = field(default_factory=list)
@@ -112,7 +112,10 @@ def compare(
             check_whole_beat(report, seconds, settle)
             reports.append(report)
             progress(next(run_count) * seconds)
-        standings.append(_standing(contestant.label, reports))
+        standing = _standing(contestant.label, reports)
+        if not config.kind.is_of_plant():
+            standing = replace(standing, relative_thrust=None)
+        standings.append(standing)
         traces.append(trace(latest_ticks.ticks))
     return standings, traces
 

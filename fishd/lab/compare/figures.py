@@ -37,14 +37,14 @@ def draw(
     """
     unit = plain(unit)
     rows = len(standings)
-    simulated = all(standing.runs for standing in standings)
+    has_best = all(standing.relative_thrust is not None for standing in standings)
     largest = max(standing.thrust + (standing.thrust_ci95 or 0.0) for standing in standings)
     with open_figure(path, (7.6, 0.7 + 1.25 * rows)) as figure:
         axes = figure.subplots(rows, 3, squeeze=False, width_ratios=(3, 3, 1.8))
         forces = [1e3 * force for trace in traces for force in trace.thrust]
         limits = min(0.0, *forces) - 4.0, 1.15 * max(0.0, *forces) + 1.0
         axes[0][1].set_title("force", fontweight="normal")
-        axes[0][2].set_title("relative thrust" if simulated else "thrust", fontweight="normal")
+        axes[0][2].set_title("relative thrust" if has_best else "thrust", fontweight="normal")
         for (angle_axis, force_axis, bar_axis), standing, trace in zip(
             axes, standings, traces, strict=True
         ):
@@ -52,7 +52,7 @@ def draw(
             angle_axis.set_title(plain(standing.contestant))
             _draw_angles(angle_axis, excerpt, amplitude)
             _draw_force(force_axis, standing, excerpt, limits, unit)
-            if simulated:
+            if has_best:
                 _draw_relative_thrust(bar_axis, standing)
             else:
                 _draw_thrust(bar_axis, standing, largest)
@@ -61,7 +61,7 @@ def draw(
             axis.tick_params(labelbottom=False)
         for axis in axes[-1][:2]:
             axis.set_xlabel("time (s)")
-        label = "% of the best\nsquare wave" if simulated else f"m{unit}"
+        label = "% of the best\nsquare wave" if has_best else f"m{unit}"
         axes[-1][2].set_xlabel(label)
         legends = [axis.get_legend_handles_labels() for axis in axes[0]]
         handles, labels = ([item for pair in legends for item in pair[k]] for k in (0, 1))

@@ -122,6 +122,7 @@ def swim(
         return Result(seconds=seconds, failure=trouble.message)
     means = beats.means()
     best = best_square_wave(config.plant, amplitude_of(controller.parameters, config.limits))
+    is_known = config.kind.is_of_plant() and best.thrust > 0.0
     error = None
     if beats.count > 1:
         error = student95(beats.count - 1) * means.thrust_deviation
@@ -130,7 +131,7 @@ def swim(
         thrust=means.thrust,
         thrust_ci95=error,
         beat_frequency=means.frequency,
-        relative_thrust=means.thrust / best.thrust if best.thrust > 0.0 else None,
+        relative_thrust=means.thrust / best.thrust if is_known else None,
         fin_amplitude=means.fin_amplitude,
         power=means.power,
         thrust_per_watt=means.thrust / watts,

@@ -1,5 +1,6 @@
 """Robots of other packages: one class and one entry point."""
 
+import csv
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -99,6 +100,28 @@ def test_a_robot_of_another_package_swims_with_its_settings_and_its_name() -> No
     report = json.loads(done.stdout)
     assert report["mean_thrust"] > 0.0
     assert not {"relative_thrust", "best_square_thrust", "best_square_frequency"} & set(report)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "result"),
+    [
+        (("compare", "square", "swing:C=0.5"), "Verdict: "),
+        (("optimise", "square", "--frequency", "1:3", "--budget", "25"), "true thrust there: "),
+        (("sweep", "square", "--frequency", "1.5,1.7", "--jobs", "1"), "best measured at "),
+    ],
+)
+def test_no_verb_compares_one_with_the_best_square_wave_of_section_plant(
+    tmp_path: Path, words: tuple[str, ...], result: str
+) -> None:
+    folder = tmp_path / "run"
+    done = fishctl(*words, "--set", "robot=twin", "--folder", str(folder))
+    assert result in done.stdout, done.stderr
+    assert "best square wave" not in done.stdout
+    assert "relative" not in done.stdout
+    if words[0] == "sweep":
+        (row, _) = csv.DictReader((folder / "rows.csv").read_text().splitlines())
+        assert row["relative_thrust"] == ""
 
 
 @pytest.mark.slow

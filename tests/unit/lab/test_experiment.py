@@ -199,11 +199,11 @@ def test_a_verb_without_a_picture_is_an_experiment_without_plot() -> None:
     @group.command()
     @experiment_options()
     def verb(run: Run) -> None:
-        run.open({})
+        run.echo(f"picture: {run.picture}")
 
     call = partial(CliRunner().invoke, group, catch_exceptions=False)
     done = call(["verb", "--on", "simulation"])
-    assert done.output == "fish: the default simulated fish\n"
+    assert done.output == "fish: the default simulated fish\npicture: None\n"
     assert "No such option '--plot'" in call(["verb", "--plot", "x.png"]).output
 
 
