@@ -19,7 +19,7 @@ def test_an_agent_swims_the_virtual_pi(tmp_path: Path) -> None:
             in_time = 0
             for step in range(40):
                 angle = 0.3 if step % 12 < 6 else -0.3
-                observation, lost, _ = link.step(angle)
+                observation, lost = link.step(angle)
                 if not lost:
                     in_time += 1
                     assert abs(observation.instruction_angle - angle) < 1e-6
