@@ -9,7 +9,7 @@ from fishd.core.signals import ReadingState
 from fishd.hardware.base import Sensor
 
 MEAN_SPAN_S = 2.0
-"""Time over which the shown readings are averaged [s]: some beats."""
+"""Time over which the shown readings are averaged, a few tail beats [s]."""
 
 
 class Readings:

@@ -56,7 +56,7 @@ class Sensor(Protocol):
 
     @property
     def declared(self) -> Mapping[str, Reading]:
-        """Its readings by name."""
+        """Readings of the sensor by name."""
 
     @property
     def required(self) -> bool:
@@ -119,7 +119,7 @@ class Robot:
     counters: Callable[[], dict[str, int]] = dict
     """Numbers of recovered errors since start, such as failed I2C transfers."""
     sensors: "tuple[Sensor, ...]" = ()
-    """Its other sensors, whose readings each tick takes after the read of the force sensor."""
+    """Other sensors, whose readings each tick takes after the read of the force sensor."""
     countdown: float = math.inf
     """Time for which the servo continues without a write [s]; see `ServoDriver.countdown`."""
     write_recipes: Callable[[Path], None] = lambda control: None

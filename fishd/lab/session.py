@@ -37,8 +37,8 @@ log = logging.getLogger(__name__)
 
 Swim = Callable[[], list[Tick]]
 Logged = Callable[[str, Mapping[str, Any], float, Swim], list[Tick]]
-"""Function that returns the ticks of a swim of a controller with these parameters, for so many
-seconds: those that it has, or else those of `Swim`. A rest has no controller."""
+"""Function that returns the ticks of a swim of a controller with these parameters, and this
+duration [s]: those that it has, or else those of `Swim`. A rest has no controller."""
 
 IDLE_LIMIT = 5.0
 """Time after which an experiment that reads no tick while the fish swims counts as hung [s]."""

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
+from fishd.core import files
 from fishd.core.errors import ConfigError, FishdError, RecordingError
 from fishd.core.signals import Tick
 from fishd.lab.experiment import Experiment
@@ -108,9 +109,16 @@ class SwimLog:
         return self._in_order(ticks)
 
     def _drop_after(self, count: int, known: int, why: str) -> None:
-        """Drop the rows after so many of those that are known, and say so: they are swum again."""
+        """Drop the rows after so many of those that are known, and say so: they are swum again.
+
+        The table with them is kept beside the new one: their recording may come back.
+        """
         if known > count:
-            log.warning("%s: %d swims and rests of the log are swum again", why, known - count)
+            folder = self._experiment.path
+            name = files.unused_name("dropped", lambda n: (folder / f"{n}-{SWIMS}").exists(), "-")
+            self._experiment.write(f"{name}-{SWIMS}", (folder / SWIMS).read_bytes())
+            again = "%s: %d swims and rests of the log are swum again; it is kept as %s-%s"
+            log.warning(again, why, known - count, name, SWIMS)
         del self._finished[count:]
         self._table.replace([row for row, _ in self._finished])
 

@@ -10,10 +10,11 @@ from fishd.cli.config import fish_options
 from fishd.cli.controller_arguments import ControllerGroup
 from fishd.cli.options import F, FiniteRange, json_option
 from fishd.cli.output import echo, echo_rows, format_controller, format_speed, print_json
+from fishd.cli.swimmer import load_swimmer
 from fishd.config import load
 from fishd.controllers import registry
 from fishd.core import text
-from fishd.core.errors import FishdError, ParameterError
+from fishd.core.errors import FishdError
 from fishd.lab.sweep.grid import Lengths, Point
 from fishd.lab.swimmer import refinement
 from fishd.lab.swimmer.refinement import Estimate, GridSpeed, Refinement
@@ -68,12 +69,7 @@ def _refine(
     overrides: tuple[str, ...],
     as_json: bool,
 ) -> int:
-    config = load(file, overrides)
-    if config.kind.is_tethered:
-        raise ParameterError(
-            f"robot: {config.robot} has no grid; a swimmer is needed, such as --config "
-            "config/swimmer.yaml"
-        )
+    config = load_swimmer(file, overrides)
     fishes = []
     for cell, step in refinement.choose_grids(config, grids):
         keys = (f"swimmer.numerics.cell={cell:.9g}", f"swimmer.numerics.step={step:.9g}")

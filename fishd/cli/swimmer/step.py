@@ -7,8 +7,7 @@ import click
 from fishd.cli.config import fish_options
 from fishd.cli.options import FiniteRange, json_option
 from fishd.cli.output import echo_rows, print_json
-from fishd.config import load
-from fishd.core.errors import ParameterError
+from fishd.cli.swimmer import load_swimmer
 
 
 @click.command()
@@ -31,12 +30,7 @@ def step(
     """
     from fishd.lab.swimmer.step_response import MAX_XI, fit, swim_step
 
-    config = load(file, overrides)
-    if config.kind.is_tethered:
-        raise ParameterError(
-            f"robot: {config.robot} has no muscles; a swimmer is needed, such as --config "
-            "config/swimmer.yaml"
-        )
+    config = load_swimmer(file, overrides)
     found = []
     for activation in activations or (0.02, 0.2, 1.0):
         found.append(fit(activation, *swim_step(config.swimmer, activation)))

@@ -322,7 +322,7 @@ class Gateways:
 
     @property
     def of_ticks(self) -> list[Gateway]:
-        """Those with a subscriber of ticks."""
+        """Gateways that have a subscriber of ticks."""
         return [gateway for gateway in self._gateways if gateway.wants_ticks]
 
     def publish(self, message: bytes) -> None:

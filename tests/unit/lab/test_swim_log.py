@@ -53,7 +53,9 @@ def test_swims_whose_ticks_are_lost_are_swum_again_and_that_is_said(
     swim(path, 1.0, 2.0)
     for recording in path.glob("*.mcap*"):
         recording.unlink()
+    before = (path / SWIMS).read_text()
     swim(path, 1.0)
+    assert (path / f"dropped-{SWIMS}").read_text() == before
     said = "swims.csv has ticks that no recording has: 2 swims and rests of the log are swum again"
     assert said in caplog.text
 
