@@ -9,6 +9,10 @@ Eng. 283, 2015, doi:10.1016/j.cma.2014.09.007; here χ = 1 − μ₀):
 The kernel is a cosine with a half width of one cell, ½(1 + cos πr), in both directions. μ₁ is the
 first moment of the water in it. Without it, the method has first order: the water next to a body
 moves with it, and the boundary layer is too thick by about half a cell.
+
+Where a body is thinner than a cell, as near the tip of a tail, χ is below 1 even in its middle, and
+it would let water through. Across itself, such a body therefore counts as one cell thick, and along
+itself, where that would thicken its boundary layers, it keeps its own thickness.
 """
 
 import math
@@ -19,6 +23,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fishd.virtual.swimmer.grid import MAX_SIZE_RATIO, Array, Field
+
+MIN_HALF_THICKNESS = 0.5
+"""Smallest half thickness of a body for the velocity across it [cells]."""
 
 
 class Covered(NamedTuple):
@@ -75,9 +82,12 @@ def circle(px: Array, py: Array, radius: float, h: float) -> Covered:
 class Painter:
     """Coverage of the faces of one velocity component by a moving body."""
 
-    def __init__(self, px: Array, py: Array, h: float) -> None:
-        """px, py: positions of the faces [m]; h: size of a cell around the body [m]"""
-        self.px, self.py, self._h = px, py, h
+    def __init__(self, k: int, px: Array, py: Array, h: float) -> None:
+        """k: 0 for the faces of u, 1 for those of v
+
+        px, py: positions of the faces [m]; h: size of a cell around the body [m]
+        """
+        self._k, self.px, self.py, self._h = k, px, py, h
         self._nearest = np.full((len(px), len(py)), np.inf)
         self._owner = np.full((len(px), len(py)), -1)
 
@@ -105,12 +115,13 @@ class Painter:
             box += [first, last]
         slices = places, angle, half_thickness, taper, spacing, clamped
         fields = self.px, self.py, *box, self._nearest, self._owner
-        covered: Covered = _paint(*slices, self._h, *fields)
+        covered: Covered = _paint(self._k, *slices, self._h, *fields)
         return covered
 
 
 @njit(cache=True, nogil=True)
 def _paint(  # pragma: no cover
+    k: int,
     places: Array,
     angle: Array,
     half_thickness: Array,
@@ -141,7 +152,7 @@ def _paint(  # pragma: no cover
     for s in range(last + 1):
         x, y = places[s, 0], places[s, 1]
         c, n = cosines[s], sines[s]
-        reach = half_thickness[s] + h
+        reach = max(half_thickness[s], MIN_HALF_THICKNESS * h) + h
         along_reach = spacing + (h if s in (0, last) else 0.0)
         wide, high = abs(c) * along_reach + abs(n) * reach, abs(n) * along_reach + abs(c) * reach
         i0 = max(first_i, first_i + int(np.ceil((x - wide - x0) / h)))
@@ -173,7 +184,9 @@ def _paint(  # pragma: no cover
             rx, ry = px[i] - places[s, 0], py[j] - places[s, 1]
             c, n = cosines[s], sines[s]
             along, across = rx * c + ry * n, ry * c - rx * n
-            half = max(half_thickness[s] + taper[s] * along, 0.0)
+            normal = c if k else n
+            thinnest = MIN_HALF_THICKNESS * h * min(1.0, 2.0 * normal * normal)
+            half = max(half_thickness[s] + taper[s] * along, thinnest)
             above, below = (half - across) / h, (-half - across) / h
             chi = kernel_integral(above) - kernel_integral(below)
             moment_across = kernel_moment(above) - kernel_moment(below)

@@ -42,7 +42,7 @@ class Immersed:
         """density: density of the water [kg/m³]"""
         self.flow, self.density, self.beam = flow, density, beam
         grid = flow.grid
-        self._painters = Painter(grid.x, grid.yc, grid.h), Painter(grid.xc, grid.y, grid.h)
+        self._painters = Painter(0, grid.x, grid.yc, grid.h), Painter(1, grid.xc, grid.y, grid.h)
         self._positions = grid.yc, grid.xc
         """Positions of the faces of u and v that the rotation of a body depends on [m]."""
         self._fixed: tuple[Covered, Covered] | None = None

@@ -37,7 +37,7 @@ def test_the_default_swimmer_has_the_natural_frequency_and_the_damping_of_the_ro
     activation: float,
 ) -> None:
     """The paper matches its body to the robot's ω₀ = 12.5 rad/s and ξ = 1.2."""
-    settings = load(ROOT / "config" / "swimmer-quick.yaml").swimmer
+    settings = load(ROOT / "config" / "swimmer.yaml").swimmer
     found = fit(activation, *swim_step(settings, activation))
     assert found.omega0 == pytest.approx(12.5, abs=0.3)
     assert found.xi == pytest.approx(1.2, abs=0.15)

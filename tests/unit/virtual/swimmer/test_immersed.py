@@ -69,6 +69,29 @@ def test_water_and_body_together_keep_their_momentum(
         assert momentum(body) == pytest.approx(gained, abs=relative * largest)
 
 
+@pytest.mark.parametrize(("angle", "lowest"), [(0.0, 1.0), (0.3, 0.8), (0.25 * np.pi, 1.0)])
+@pytest.mark.parametrize("half_cells", [0.05, 0.5])
+def test_a_plate_thinner_than_a_cell_lets_little_water_through(
+    half_cells: float, angle: float, lowest: float
+) -> None:
+    """The added mass of a plate across itself is ρπ(L/2)²; with its own thickness it had 0.20."""
+    cell = 1e-3
+    positions = edges(-0.4, 0.4, (-0.05, 0.05), cell, 1.1)
+    flow = Flow(Grid(positions, positions), 1e-6, "slip")
+    beam = Beam(LENGTH, lambda X: np.full_like(X, half_cells * cell), np.ones_like, 10, 0.5 * cell)
+    beam.q[:2] = -0.5 * LENGTH * np.cos(angle), -0.5 * LENGTH * np.sin(angle)
+    beam.q[2:] = angle
+    body = Immersed(flow, 1000.0, beam)
+    across = np.array([-np.sin(angle), np.cos(angle)])
+    jacobian = beam.motion(np.full(beam.slices, angle))[:, :2]
+    force = np.einsum("s,skq,k->q", beam.share, jacobian, across)
+    for _ in range(100):
+        body.step(1e-3, force)
+    velocity = float(beam.share @ body.velocity[:, :2] @ across)
+    added = 0.1 / velocity / (1000.0 * np.pi * (0.5 * LENGTH) ** 2)
+    assert lowest < added < 1.1
+
+
 def compute_bend(steps: int) -> float:
     """Return the bend after 0.1 s [rad]."""
     body = swimmer()

@@ -120,7 +120,10 @@ def test_the_loop_swims_it_and_latches_a_fault_of_its_own_where_it_is_lost() -> 
         assert supervisor.reason.code == "fish-lost"
     tick = publisher.ticks[29]
     assert tick.mode == "running"
-    assert tick.fin_velocity == pytest.approx(tick.alpha_rate, rel=0.5)
+    sensed, true = zip(
+        *((t.fin_velocity, t.alpha_rate) for t in publisher.ticks[5:30]), strict=True
+    )
+    assert np.corrcoef(sensed, true)[0, 1] > 0.9
     assert tick.speed == run.fish.motion.speed
     assert tick.x == run.fish.motion.x
 
