@@ -150,6 +150,11 @@ def format_speed(speed: float, ci95: float | None, grid_error: float | None) -> 
     return f"{value}, {text.format_half_width(grid_error)} by the grid"
 
 
+def format_ratio(ratio: float, grid_error: float) -> str:
+    """Return a ratio of speeds with its error by the grid."""
+    return f"{ratio:.3f} ± {grid_error:.3f} by the grid"
+
+
 def format_time_of_day(t: float) -> str:
     """Return the local time of day of a unix time [s]: `13:05:59`."""
     return time.strftime("%H:%M:%S", time.localtime(t))

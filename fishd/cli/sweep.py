@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from fishd.cli.controller_arguments import ValuesType
 from fishd.cli.experiment import ChosenFish, ResumableGroup, Run, experiment_options
 from fishd.cli.options import FiniteRange, for_option
-from fishd.cli.output import echo, format_count, format_speed, warn_of_fin
+from fishd.cli.output import echo, format_count, format_ratio, format_speed, warn_of_fin
 from fishd.config import Config
 from fishd.controllers.base import Limits
 from fishd.core import text
@@ -229,7 +229,7 @@ def _show(run: Run, folder: "SweepFolder", points: "list[Point]", units: dict[st
             if best.whole_ticks:
                 description = _format_whole_ticks(best.whole_ticks, quantity.unit)
                 echo(f"{curve.label}, of whole ticks: {description}")
-        _echo_grid_errors(folder, points)
+        _echo_grid_errors(run.fish, folder, points)
         echo(f"table: {folder.path / 'rows.csv'}")
 
     run.show([curves.best_to_builtins(best, quantity) for _, best in bests], print_bests)
@@ -248,8 +248,8 @@ def _show(run: Run, folder: "SweepFolder", points: "list[Point]", units: dict[st
         warn_of_fin(largest, f" at {label}")
 
 
-def _echo_grid_errors(folder: "SweepFolder", points: "list[Point]") -> None:
-    """Print what the grid adds to the errors of speeds."""
+def _echo_grid_errors(fish: ChosenFish, folder: "SweepFolder", points: "list[Point]") -> None:
+    """Print what the grid adds to the errors of speeds, and of their ratios to the fastest."""
     if folder.quantity.name != "speed":
         return
     results = [folder.results.get(folder.key(point)) for point in points]
@@ -262,6 +262,30 @@ def _echo_grid_errors(folder: "SweepFolder", points: "list[Point]") -> None:
             f"by the grid: not known at {len(errors) - len(known)} of "
             f"{format_count(len(errors), 'point')}; 'fishctl swimmer refine' estimates it"
         )
+    if len(known) > 1:
+        _echo_ratios(fish, folder, points)
+
+
+def _echo_ratios(fish: ChosenFish, folder: "SweepFolder", points: "list[Point]") -> None:
+    """Print the ratios of speeds to the fastest one whose error by the grid is known."""
+    from fishd.controllers import registry
+    from fishd.lab.swimmer import refinement
+
+    swims = []
+    for point, config in _configure_points(fish, points):
+        result = folder.results.get(folder.key(point))
+        if result and result.value and getattr(result, "grid_error", None) is not None:
+            limits = replace(config.limits, virtual=True)
+            parameters = registry.check(point.controller, point.parameters, limits)
+            values = msgspec.structs.asdict(parameters)
+            stored = refinement.find(config, point.controller, values)
+            swims.append((result.value, point, config.swimmer.numerics.cell, stored))
+    speed, fastest, cell, others = max(swims, key=lambda swim: swim[0])
+    for value, point, size, stored in swims:
+        share = refinement.ratio_error(stored, others, cell)
+        if point is not fastest and size == cell and share is not None:
+            ratio = value / speed
+            echo(f"{point.label()} / {fastest.label()}: {format_ratio(ratio, abs(ratio) * share)}")
 
 
 def _format_result(result: "PointResult", quantity: "Quantity") -> str:

@@ -106,7 +106,7 @@ def swim(
     """
     controller = registry.create(name, parameters, replace(config.limits, virtual=True))
     parameter_values = msgspec.structs.asdict(controller.parameters)
-    grid_error = find_grid_error(config, name, parameter_values)  # raises before the swim
+    share = find_grid_error(config, name, parameter_values)  # raises before the swim
     ticks, first = count_ticks(seconds, settle, config.tick)
     if first + 1 >= ticks:
         raise ParameterError(
@@ -172,8 +172,9 @@ def swim(
         report = None
         if len(track) > first + 1:
             columns = {key: values[first:] for key, values in track.columns().items()}
+            measured = gait(columns, config.swimmer)
             report = SwimReport(
-                **msgspec.structs.asdict(gait(columns, config.swimmer)),
+                **msgspec.structs.asdict(measured),
                 controller=name,
                 parameters=parameter_values,
                 seconds=len(track) * config.tick,
@@ -182,7 +183,7 @@ def swim(
                 mode=loop.supervisor.mode.value,
                 reason=loop.supervisor.reason,
                 fallback=loop.active.fallback,
-                grid_error=grid_error,
+                grid_error=None if share is None else share * abs(measured.speed),
                 real_time_factor=(len(track) - resumed_ticks) * config.tick / elapsed,
             )
     return SwimResult(

@@ -1,4 +1,4 @@
-"""The steady speed of a free swimmer, measured over whole beats."""
+"""The speed of a free swimmer, steady or soon after its start, measured over whole beats."""
 
 import math
 from collections.abc import Callable
@@ -35,6 +35,8 @@ STEADY_FRACTION, SCATTER_FRACTION = 0.02, 0.05
 The speed is steady if the means of its two halves differ by less than the first fraction. A
 difference up to the second fraction is allowed if it lies within its 95 % confidence interval.
 """
+FROM_REST = Lengths(settle=0.0, periods=3)
+"""Lengths of a swim from rest: its beats 2 to 4 are measured."""
 _STOP_CHECK_TICKS = 50
 
 
@@ -64,6 +66,7 @@ def swim_freely(
     show no trend. After `MAX_SWIM_S` seconds the later half is measured, or `lengths.periods` beats
     if the half has fewer, and `settled_time` is None.
 
+    lengths: with `FROM_REST`, the beats after the first one are measured, steady or not
     publisher: receives every tick and every event; None to create no messages
     on_start: called before the first tick
     stop: called regularly; if it returns True, the swim ends and None is returned
@@ -74,7 +77,7 @@ def swim_freely(
         point.controller, point.parameters, replace(config.limits, virtual=True)
     )
     values = msgspec.structs.asdict(controller.parameters)
-    grid_error = find_grid_error(config, point.controller, values)  # raises before the swim
+    share = find_grid_error(config, point.controller, values)  # raises before the swim
     track = Track()
     beat_starts: list[int] = []
     with VirtualRun(config, publisher) as run:
@@ -98,7 +101,8 @@ def swim_freely(
             if len(track) % _STOP_CHECK_TICKS == 0 and stop():
                 return None
     result = _make_result(track, beat_starts, first, lengths, config)
-    return replace(result, grid_error=grid_error)
+    error = None if share is None or result.speed is None else share * abs(result.speed)
+    return replace(result, grid_error=error)
 
 
 def _is_long_enough(track: Track, beat_starts: list[int], lengths: Lengths, tick: float) -> bool:
@@ -111,9 +115,11 @@ def _is_long_enough(track: Track, beat_starts: list[int], lengths: Lengths, tick
 def _find_first_row(
     track: Track, beat_starts: list[int], lengths: Lengths, config: Config
 ) -> int | None:
-    """Return the row of the first measured beat; None while the speed changes."""
+    """Return the row of the first measured beat; None while more beats are needed."""
     if len(beat_starts) - 1 < lengths.periods:
         return None
+    if lengths is FROM_REST:
+        return beat_starts[0]
     time, x = _read_positions(track, beat_starts)
     beat = find_first_measured(time, x)
     if len(beat_starts) - 1 - beat < lengths.periods:

@@ -16,8 +16,9 @@ from fishd.lab.sweep import figure
 from fishd.lab.sweep.curves import best_to_builtins, find_best, make_curves
 from fishd.lab.sweep.grid import Lengths, Point
 from fishd.lab.sweep.results import SpeedResult, SweepFolder
-from fishd.lab.swimmer import speed
-from fishd.lab.swimmer.speed import find_first_measured, is_steady, swim_freely
+from fishd.lab.swimmer import refinement, speed
+from fishd.lab.swimmer.refinement import GridSpeed, Refinement
+from fishd.lab.swimmer.speed import FROM_REST, find_first_measured, is_steady, swim_freely
 
 WAVE = Point("square", {"frequency": 3.0})
 
@@ -73,6 +74,16 @@ def test_a_fish_is_judged_as_soon_as_its_speed_is_steady(
     assert 0.3 < result.settled_time < 1.0
     assert result.beats == 2
     assert result.seconds == pytest.approx(result.settled_time + 2.0 / 3.0, abs=0.05)
+
+
+def test_beats_2_to_4_of_a_swim_from_rest_are_measured_steady_or_not(config: Config) -> None:
+    result = swim_freely(WAVE, config, FROM_REST, None)
+    assert result
+    assert result.beats == 3
+    assert result.settled_time == pytest.approx(1.0 / 3.0, abs=0.02)
+    assert result.seconds == pytest.approx(4.0 / 3.0, abs=0.05)
+    assert result.speed is not None
+    assert 0.01 < result.speed < 0.1
 
 
 def test_a_fish_that_is_lost_is_a_point_without_a_speed(
@@ -145,6 +156,37 @@ def test_a_sweep_of_swimmers_is_a_table_of_speeds_with_their_recordings(
     assert float(row["strouhal"] or 1.0) > 0.0
     assert int(row["beats"]) >= 2
     assert (folder / row["recording"]).is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_no_worker_stays")
+def test_a_sweep_prints_ratios_to_the_fastest_gait_with_their_errors_by_the_grid(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(speed, "MAX_SWIM_S", 2.0)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    for frequency, speeds in ((5.0, (0.08, 0.10)), (3.0, (0.06, 0.09))):
+        grids = zip((0.002, 0.001), speeds, strict=True)
+        refinement.save(
+            Refinement(
+                fish=refinement.describe_fish(coarse()),
+                controller="sine",
+                parameters={"frequency": frequency, "amplitude": None},
+                settled=True,
+                grids=tuple(GridSpeed(cell=cell, step=1e-3, speed=speed) for cell, speed in grids),
+            )
+        )
+    fast = ["--settle", "0.5", "--periods", "2", "--jobs", "1", "--folder", str(tmp_path / "run")]
+    done = fishctl("sweep", "sine", "--frequency", "3,4,5", *OPTIONS, *fast)
+    with (tmp_path / "run" / "rows.csv").open(newline="") as file:
+        slow, _, quick = (float(row["speed"]) for row in csv.DictReader(file))
+    names = ["sine frequency=3 Hz", "sine frequency=5 Hz"]
+    if slow > quick:
+        names.reverse()
+    ratio = min(slow, quick) / max(slow, quick)
+    share = 6.0 * (0.9 - 0.75) / 0.75 if slow < quick else 6.0 * (4.0 / 3.0 - 10.0 / 9.0) * 0.75
+    assert f"{' / '.join(names)}: {ratio:.3f} ± {ratio * share:.3f} by the grid" in done.stdout
+    assert done.stdout.count(" / ") == 1
 
 
 def test_a_grid_with_a_fish_that_cannot_be_computed_is_refused_first(tmp_path: Path) -> None:
