@@ -46,6 +46,8 @@ def sections() -> list[tuple[str, str, str]]:
 
 def section(name: str) -> str:
     """Return the text between the markers of this name."""
+    if name == SWIMS:
+        return swims()
     words = {True: "yes", False: "**no**", None: "–"}
     return table(
         "the paper | computed here | agrees",
@@ -245,53 +247,80 @@ def learning() -> Iterator[Claim]:
 
 
 def swimming() -> Iterator[Claim]:
-    """Return the claims on the free swimmer."""
-    fastest_waves = list(figure_6.fastest())
-    if not fastest_waves:  # without results yet
-        return
-    best = ", ".join(
-        f"{frequency:g} Hz {first}{''.join(f' or {wave}' for wave in alike)}"
-        for frequency, first, alike in fastest_waves
-    )
+    """Return the claims on the free swimmer, for each reading of the paper that swims the waves."""
+    for fish, reading in figure_6.READINGS.items():
+        if reading.waves:
+            yield from _swimming(fish)
+
+
+def _swimming(fish: str) -> Iterator[Claim]:
+    margins = _margins(fish, figure_6.CELL)
+    fine = _margins(fish, figure_6.FINE_CELL)
+    text = f"faster than sine and triangle by {_percentages(margins)}"
+    if fine:
+        text += f"; on cells of {figure_6.FINE_CELL} mm by {_percentages(fine)}"
     yield Claim(
-        "the square wave is the fastest at every frequency",
-        f"the fastest, within the intervals: {best}",
-        all(first == "square" and not alike for _, first, alike in fastest_waves),
+        f"the square wave is the fastest at every frequency: {fish}",
+        text,
+        all(value > 0.0 for value in (*margins.values(), *fine.values())),
     )
-    waves = [row for wave in figure_6.WAVES for row in _swum(wave)]
+    waves = [row for wave in figure_6.WAVES for row in _swum(fish, wave)]
     top = max(waves, key=lambda row: row["speed_mm_per_s"])
-    for row in _swum("swing"):
-        share = row["speed_mm_per_s"] / top["speed_mm_per_s"]
-        yield Claim(
-            "swing with C = 0 is close to the maximum"
-            if row["setting"] == 0.0
-            else "… and with C = 0.6",
-            f"{_speed(row)} mm/s at "
-            f"{row['frequency_Hz']:.2f} Hz: {share:.0%} of the fastest wave, the "
-            f"{top['controller']} wave of {top['setting']:g} Hz with "
-            f"{_speed(top)} mm/s",
-            None if row["setting"] else share > swing_map.NEARLY_BEST,
-        )
+    (row,) = (row for row in _swum(fish, "swing") if row["setting"] == 0.0)
+    share = row["speed_mm_per_s"] / top["speed_mm_per_s"]
+    yield Claim(
+        f"swing with C = 0 is close to the maximum: {fish}",
+        f"{share:.1%} of the fastest wave, the {top['controller']} wave of {top['setting']:g} Hz",
+        share > swing_map.NEARLY_BEST,
+    )
     swings = [0.5 * row["tail_side_to_side_over_L"] for row in waves]
     yield Claim(
-        "tail amplitude of about 0.2 L",
+        f"tail amplitude of about 0.2 L: {fish}",
         f"{min(swings):.2f} to {max(swings):.2f} L to either side while it swims; the muscles "
         "alone bend it by 0.21 L",
         None,
     )
 
 
+def _margins(fish: str, cell: float) -> dict[float, float]:
+    """Return how much faster the square wave is, as a fraction, by frequency [Hz]."""
+    margins = {each: figure_6.margin(fish, each, cell) for each in figure_6.FREQUENCIES}
+    return {each: value for each, value in margins.items() if value is not None}
+
+
+def _percentages(margins: dict[float, float]) -> str:
+    values = ", ".join(f"{100.0 * value:+.0f}" for value in margins.values())
+    return f"{values} % at {', '.join(f'{each:g}' for each in margins)} Hz"
+
+
+def swims() -> str:
+    """Return the table of the swings, a row for each reading and C, beside the best square wave."""
+    rows = []
+    for fish in figure_6.READINGS:
+        best = max(_swum(_wave_fish(fish), "square"), key=lambda row: row["speed_mm_per_s"])
+        square = f"{_speed(best)} at {best['setting']:g} Hz"
+        for row in _swum(fish, "swing"):
+            share = row["speed_mm_per_s"] / best["speed_mm_per_s"]
+            swing = f"{_speed(row)} at {row['frequency_Hz']:.2f} Hz"
+            rows.append((fish, square, f"{row['setting']:g}", swing, f"{share:.1%}"))
+    return table("reading | best square wave (mm/s) | C | swing (mm/s) | share", rows)
+
+
+def _wave_fish(fish: str) -> str:
+    """Return the reading with the waves of this body."""
+    return fish if figure_6.READINGS[fish].waves else "damped"
+
+
 def _speed(row: dict[str, Any]) -> str:
     """Return speed ± averaging, and ± grid where that is known."""
-    text = f"{row['speed_mm_per_s']:.2f} ± {row['ci95_mm_per_s']:.2f}"
-    case = figure_6.Case(row["controller"], row["setting"], row["cell_mm"])
-    error = figure_6.TABLE.grid_error(*case)
+    text = f"{row['speed_mm_per_s']:.1f} ± {row['ci95_mm_per_s']:.1f}"
+    error = figure_6.Case(*(row[key] for key in figure_6.KEYS)).grid_error()
     return text if error is None else f"{text} ± {error:.0f}"
 
 
-def _swum(controller: str) -> list[dict[str, Any]]:
-    stored = figure_6.TABLE
-    return read(stored.name, controller=controller, cell_mm=stored.cell)
+def _swum(fish: str, controller: str) -> list[dict[str, Any]]:
+    having = {"fish": fish, "controller": controller, "cell_mm": figure_6.CELL, "start": 1.0}
+    return read(figure_6.NAME, **having)
 
 
 def _steps(policy: str) -> int:
@@ -325,4 +354,5 @@ GROUPS: dict[str, Callable[[], Iterator[Claim]]] = {
     "learning": learning,
     "free swimming": swimming,
 }
-SECTIONS = tuple(GROUPS)
+SWIMS = "swings of the free swimmer"
+SECTIONS = (*GROUPS, SWIMS)
