@@ -4,8 +4,8 @@ import asyncio
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
-from contextlib import AsyncExitStack, closing, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AsyncExitStack, closing, contextmanager, suppress
 from typing import Any, NamedTuple
 
 import msgspec
@@ -19,6 +19,7 @@ from fishd.core import text
 from fishd.core.addresses import find_control_address
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, LeaseLost
+from fishd.core.protocol import PolicyInfo
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
 from fishd.window.estop_path import EstopPath
 from fishd.window.live import encode_message
@@ -300,12 +301,23 @@ class FishLink:
         """
         if op == "stop":  # must not wait for a controller that loads
             return _builtins(await self._stopper.stop())
+        with self._waiting_request():
+            async with self._taking:
+                return await self._perform(op, arguments, holder, take, check)
+
+    async def list_policies(self) -> list[PolicyInfo]:
+        """Return the named policies of fishd; raise `FishError`."""
+        with self._waiting_request():
+            return await self._fish.policies()
+
+    @contextmanager
+    def _waiting_request(self) -> Iterator[None]:
+        """Count a request that may wait for this fish; raise `Busy` for one too many."""
         if self._waiting >= MAX_WAITING_REQUESTS:
             raise Busy(f"{self._waiting} requests wait for this fish already; try again later")
         self._waiting += 1
         try:
-            async with self._taking:
-                return await self._perform(op, arguments, holder, take, check)
+            yield
         finally:
             self._waiting -= 1
 

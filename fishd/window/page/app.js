@@ -4,8 +4,9 @@ import {
   significant, timeOfDay, unitText, useState,
 } from "./common.js";
 import { Charts } from "./charts.js";
-import { defaultOf, Drive, driverName, request, selectionOf } from "./controls.js";
+import { Drive, driverName, request } from "./controls.js";
 import { Experiments, plain, Runs } from "./experiments.js";
+import { defaultOf } from "./fields.js";
 import { TopView } from "./fish.js";
 import { Ring, Stream, ticksOf } from "./stream.js";
 

@@ -1,6 +1,6 @@
 // Experiments as child processes of the server, with the command line that each ran, and kept runs.
 import { call, controllerText, duration, fetchPicture, forceUnit, html, interval, number, numberIn, recall, remember, sentence, useEffect, useState } from "./common.js";
-import { defaultOf, selectionOf, shownParameters } from "./controls.js";
+import { defaultOf, missingOf, selectionOf, shownParameters } from "./fields.js";
 
 const KINDS = {
   measure: { title: "Measure", text: "Swims and rests in turn; thrust with its 95 % interval." },
@@ -45,7 +45,8 @@ function selectionWithOwn(state) {
     const field = controller.parameters.find((candidate) => candidate.name === name);
     return value !== null && value !== defaultOf(field);
   });
-  return { controller, own: Object.fromEntries(own) };
+  const missing = controller ? missingOf(controller, shownParameters(controller, state.status, edited, applied)) : [];
+  return { controller, own: Object.fromEntries(own), missing };
 }
 
 export function Experiments(page) {
@@ -53,7 +54,7 @@ export function Experiments(page) {
   const [form, setForm] = useState(() => recall("experiment", {
     kind: "measure", seconds: "", values: "", parameter: "", contestants: "square swing", runs: "", subject: "", note: "",
   }));
-  const { controller, own } = selectionWithOwn(state);
+  const { controller, own, missing } = selectionWithOwn(state);
   const set = (key) => (value) => {
     const next = { ...form, [key]: value };
     remember("experiment", next);

@@ -5,18 +5,16 @@ import json
 import re
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import pytest
-from playwright.sync_api import APIResponse, Page, Route, expect
+from playwright.sync_api import APIResponse, Route, expect
 from rigs.browser import needs_browser, open_page, shared_browser
-from rigs.processes import PATIENCE, Daemon, running, wait_until
+from rigs.live_page import live_page, swim
+from rigs.processes import Daemon, running, wait_until
 from rigs.virtual_pi_process import Pi
-from rigs.window_process import NETWORK_HOST, Browser, WindowProcess, run_apart
-from rigs.window_process import open_page as open_socket
+from rigs.window_process import NETWORK_HOST, WindowProcess
 
 pytestmark = needs_browser
 
@@ -24,7 +22,6 @@ AXE = resources.files("axe_playwright_python").joinpath("axe.min.js")
 """The program that looks for barriers."""
 MAX_ASSETS_BYTES = 120_000
 RESOLVED = f"--host-resolver-rules=MAP {NETWORK_HOST} 127.0.0.1"
-expect.set_options(timeout=PATIENCE * 1e3)
 
 # Runs in the page: `app` is its own module, with the state that it shows.
 APP = "const app = await import('/app.js');"
@@ -82,33 +79,9 @@ def browser() -> Iterator[None]:
 
 
 @pytest.fixture
-def window(shared_window: WindowProcess, shared_daemon: Daemon) -> WindowProcess:
+def window(free_window: WindowProcess) -> WindowProcess:
     """Return the window of the module, which no page drives, and whose fish is at rest."""
-
-    async def release() -> None:
-        async with Browser(shared_window.url) as browser, open_socket(browser) as page:
-            await page.drive()
-            await page.post("release")
-
-    run_apart(release())
-    shared_daemon.at_rest()
-    return shared_window
-
-
-@contextmanager
-def live_page(url: str, **settings: Any) -> Iterator[tuple[Page, list[str]]]:
-    """Open the page, and wait until it shows ticks."""
-    with open_page(f"{url}/", **settings) as (page, complaints):
-        expect(page.locator("#connection")).to_contain_text("live")
-        yield page, complaints
-
-
-def swim(page: Page, controller: str = "swing") -> None:
-    page.select_option("#controller", controller)
-    with page.expect_response("**/request", timeout=PATIENCE * 1e3) as response:
-        page.click("#start")
-    assert response.value.ok
-    expect(page.locator("#mode")).to_have_text("running")
+    return free_window
 
 
 def test_a_chart_moves_and_nothing_leaves_this_machine(window: WindowProcess) -> None:
@@ -161,26 +134,6 @@ def test_stop_lets_the_fish_rest_and_keeps_the_parameters_for_the_next_start(
         page.click("#start")
         wait_until(lambda: daemon.status().parameters.get("frequency") == 1.5)
         assert complaints == []
-
-
-def test_every_controller_that_is_listed_can_be_started(window: WindowProcess) -> None:
-    needed = {"target": "0.01", "policy": "default-fish"}
-    with live_page(window.url) as (page, _):
-        listed = page.locator("#controller option").all_inner_texts()
-        assert {"hold", "square", "swing", "thrust", "ppo", "remote"} <= set(listed)
-        for name in listed:
-            page.select_option("#controller", name)
-            expect(page.locator("#start")).to_contain_text(name)
-            for parameter, value in needed.items():
-                field = page.locator(f"#parameter-{parameter}")
-                if field.count() and not field.input_value():
-                    expect(page.locator("#start")).to_be_disabled()
-                    field.fill(value)
-                    field.blur()
-            with page.expect_response("**/request", timeout=PATIENCE * 1e3) as response:
-                page.click("#start")
-            assert response.value.ok, f"{name}: {response.value.text()}"
-            expect(page.locator("#start")).to_have_text(f"Restart {name}")
 
 
 def test_the_outcome_of_an_emergency_stop_is_in_sight_of_a_page_that_is_scrolled(
