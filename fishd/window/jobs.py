@@ -6,7 +6,6 @@ window that was killed is among the jobs of its successor.
 
 import asyncio
 import os
-import shutil
 import signal
 import time
 from collections.abc import Callable, Iterable, Set
@@ -248,7 +247,7 @@ class Jobs:
         if job.kind == "simulate":
             return [f"--record={self._recording_of(job)}", "--json"]
         place = [] if is_resumed else ["--on=live", f"--folder={self._folder / job.run}"]
-        return [*place, f"--plot={self._scratch}/{job.id}.png", "--json"]
+        return [*place, "--json"]
 
     def _recording_of(self, job: Job) -> Path:
         """Return the path of the recording of a simulated fish."""
@@ -290,7 +289,6 @@ class Jobs:
             if job.kind == "simulate" and job.exit == 0:
                 curve = await read_curve(self._recording_of(job), self._folder)
                 job.result = {**job.result, "curve": curve}
-            await asyncio.to_thread(self._keep_picture, job)
             stopped = job.id in self._stopping
             await asyncio.to_thread(self._conclude, job)
             job.state = "stopped" if stopped else "done" if job.exit == 0 else "failed"
@@ -306,14 +304,6 @@ class Jobs:
             self.runs.forget()
             self._keep_running()
             self._tell(job)
-
-    def _keep_picture(self, job: Job) -> None:
-        """Move the picture of an experiment into its folder."""
-        if not job.run:
-            return
-        picture, folder = self._scratch / f"{job.id}.png", self._folder / job.run
-        if picture.exists() and folder.is_dir():
-            shutil.move(picture, folder / f"{job.kind}.png")
 
     async def _run_child(self, job: Job, words: list[str]) -> bytes:
         """Run fishctl; return its output."""

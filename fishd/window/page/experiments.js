@@ -277,7 +277,7 @@ function Run({ run, page }) {
     ${resumable && html`<div class="buttons"><button type="button" class="primary" disabled=${!mayDrive}
       onClick=${() => startJob(page, "resume", { run: run.name })}>Resume</button>
       <span class="muted">It ended before it was complete; nothing is measured again.</span></div>`}
-    ${(run.kind === "recording" || run.state !== "unfinished") && html`<${Plot} name=${run.name} />`}`;
+    ${run.state !== "running" && html`<${Plot} name=${run.name} />`}`;
 }
 
 function Plot({ name }) {
