@@ -27,7 +27,7 @@ def draw(folder: Path, header: Header, path: Path) -> None:
     """
     recordings = list_recordings(folder)
     if not recordings:
-        raise FishdError(f"{folder}: nothing can be drawn: there is no recording in it")
+        raise FishdError(f"{folder}: nothing can be drawn: it contains no recording")
     measurement = _evaluate(folder, header, recordings) if header.kind == "measure" else None
     if measurement:
         measurement_figure.draw(measurement, header.config["tick"], path)

@@ -49,8 +49,8 @@ class Job(Struct):
     fish: str
     command: list[str]
     """Words that a person would type."""
-    state: Literal["running", "done", "failed", "stopped", "lost"]
-    """`lost`: its window was killed."""
+    state: Literal["running", "done", "failed", "stopped", "lost", "dismissed"]
+    """`lost`: its window was killed; `dismissed`: it is no longer listed."""
     elapsed: float
     """Time since its start, until its end at most [s]."""
     run: str = ""
@@ -258,9 +258,7 @@ class Jobs:
 
     def stop(self, name: str) -> Job:
         """Interrupt a job as Ctrl-C does: an experiment lets the fish rest first."""
-        job = self._jobs.get(name)
-        if job is None:
-            raise JobError(f"there is no job '{text.quoted(name)}'")
+        job = self._find(name)
         if name in self._tasks and name not in self._stopping:
             self._stopping.add(name)
             self._signal(name, signal.SIGINT)
@@ -268,6 +266,19 @@ class Jobs:
             loop.call_later(STOP_TIMEOUT_S, self._signal, name, signal.SIGTERM)
             loop.call_later(2.0 * STOP_TIMEOUT_S, self._signal, name, signal.SIGKILL)
         return job
+
+    def dismiss(self, name: str) -> Job:
+        """Remove a job that has ended from the list; its run is kept; raise `JobError`."""
+        job = self._find(name)
+        if job.state == "running":
+            raise JobError("this job runs; stop it first")
+        job.state = "dismissed"
+        return self._jobs.pop(name)
+
+    def _find(self, name: str) -> Job:
+        if job := self._jobs.get(name):
+            return job
+        raise JobError(f"there is no job '{text.quoted(name)}'")
 
     def stop_without_access(self, paired: Set[str]) -> None:
         """Stop the jobs of devices that are not among the paired ones, by their identifiers."""

@@ -20,6 +20,12 @@ def live_page(url: str, **settings: Any) -> Iterator[tuple[Page, list[str]]]:
         yield page, complaints
 
 
+def go(page: Page, place: str) -> None:
+    """Show a part of the page: `live`, `experiments`, `runs` or `fish`."""
+    page.click(f"#places a[href='#{place}']")
+    expect(page.locator(f"main[data-place={place}]")).to_be_visible()
+
+
 def swim(page: Page, controller: str = "swing") -> None:
     """Start a controller, and wait until the fish swims."""
     page.select_option("#controller", controller)

@@ -47,7 +47,7 @@ export function Drive({ state, act, changed, changeRole, experiment }) {
   const missing = missingOf(controller, parameters);
 
   return html`
-    <h2 id="drive-title">Controller</h2>
+    <h2 id="drive-title" class="unseen">Controller</h2>
     ${!mayDrive && html`<p class="note">This device may only watch and use the E‑stop.</p>`}
     ${experiment && html`<p class="note">The experiment <b>${experiment.name}</b> (process ${experiment.pid}${experiment.host && ` on ${experiment.host}`})
       holds the fish. Stop ends it.</p>`}
@@ -70,10 +70,6 @@ export function Drive({ state, act, changed, changeRole, experiment }) {
         ${state.controllers.map(({ name }) => html`<option value=${name}>${name}</option>`)}
       </select></label>
     <p class="summary">${controller.summary}</p>
-    <div class="fields">
-      ${controller.parameters.map((field) => html`<${Field} key=${`${controller.name}.${field.name}`} field=${field}
-        value=${parameters[field.name]} fish=${state.name} status=${state.status} edit=${edit} disabled=${!mayDrive} />`)}
-    </div>
     <div class="buttons">
       <button type="button" id="start" class="primary" disabled=${!mayDrive || latched || missing.length > 0} onClick=${start}>
         ${running ? "Restart" : "Start"} ${controller.name}</button>
@@ -84,6 +80,10 @@ export function Drive({ state, act, changed, changeRole, experiment }) {
       : missing.length ? `Needed first: ${missing.map(({ name }) => name).join(", ")}.`
       : running ? `Changes apply at once, from the next tick on${controller.parameters.some(({ file }) => file) ? "; another file at a restart" : ""}.`
       : "Changes apply at the start."}</p>
+    <div class="fields" role="group" aria-label="Parameters">
+      ${controller.parameters.map((field) => html`<${Field} key=${`${controller.name}.${field.name}`} field=${field}
+        value=${parameters[field.name]} fish=${state.name} status=${state.status} edit=${edit} disabled=${!mayDrive} />`)}
+    </div>
     <div class="tools">
       <button type="button" id="tare" disabled=${!mayDrive} title="Takes the present force as zero; the fish must be still."
         onClick=${() => act("tare", {})}>Tare</button>

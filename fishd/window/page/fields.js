@@ -108,10 +108,9 @@ export function Field({ field, value, disabled, fish, status, edit }) {
         ${word === "null" ? nullName : word}</label>`)}
       <${Value} ...${{ field, value, special, id, fish, disabled, status, send }} /><span class="unit">${unitText(field.unit)}</span>
     </span>
-    ${slider && html`<input type="range" class="slider" aria-label=${`${field.name}, slider`} min=${slider.low} max=${slider.high}
+    ${slider && html`<span class="slide"><span>${short(slider.low)}</span><input type="range" aria-label=${`${field.name}, slider`} min=${slider.low} max=${slider.high}
       step=${slider.step} disabled=${disabled || special !== null} value=${special === null ? value ?? fallback : fallback}
-      onInput=${(event) => send(Number(event.target.value))} />
-      <span class="bounds"><span>${short(slider.low)}</span><span>${short(slider.high)}</span></span>`}
+      onInput=${(event) => send(Number(event.target.value))} /><span>${short(slider.high)}</span></span>`}
     <small id=${`${id}-help`}>${field.description.replace("null:", `${nullName}:`)}</small>
   </div>`;
 }

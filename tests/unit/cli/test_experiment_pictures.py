@@ -41,4 +41,4 @@ def test_what_cannot_be_drawn_of_an_experiment_is_refused_in_one_line(folder: Pa
     fishctl("measure", "swing", *SIMULATED, "--folder", str(folder))
     assert "for a recording" in one_line(fishctl("plot", str(folder), "--from", "3"))
     next(folder.glob("*.mcap")).unlink()
-    assert "there is no recording in it" in one_line(fishctl("plot", str(folder)))
+    assert "it contains no recording" in one_line(fishctl("plot", str(folder)))
