@@ -119,6 +119,24 @@ def pair(scope: "Scope", url: str | None, as_json: bool, **values: Any) -> None:
 
 @window.command()
 @window_options
+@click.argument("name")
+@json_option
+def token(name: str, as_json: bool, **values: Any) -> None:
+    """Print a token with which a program reads /metrics.
+
+    A program on another computer, such as Prometheus, sends it as `Authorization: Bearer TOKEN`. It
+    is a paired device of this NAME, which may only watch: `fishctl window revoke` ends its access.
+    """
+    devices = _open_devices(_load_running(**values))
+    device, secret = devices.pair(devices.invite("watch"), name)
+    if as_json:
+        print_json({"name": device.name, "token": secret})
+    else:
+        echo(secret)
+
+
+@window.command()
+@window_options
 @json_option
 def devices(as_json: bool, **values: Any) -> None:
     """List the paired devices."""

@@ -79,9 +79,10 @@ class AccessControl:
             web.post("/api/unpair", self._unpair),
         ]
 
-    def find(self, request: web.Request) -> Access:
-        """Return the permissions of a request."""
-        device = self._devices.find(request.cookies.get(COOKIE))
+    def find(self, request: web.Request, takes_bearer: bool = False) -> Access:
+        """Return the permissions of a request, as `require` does."""
+        token = takes_bearer and _read_bearer(request)
+        device = self._devices.find(token or request.cookies.get(COOKIE))
         loopback = not self._pair_all and is_loopback(request)
         scope: Scope | None = "drive" if loopback else device.scope if device else None
         return Access(scope, None if loopback else device, loopback)
@@ -97,17 +98,23 @@ class AccessControl:
         """Return the identifiers of all devices that have access."""
         return {device.id for device in self._devices.all()} | {""}
 
-    def require(self, request: web.Request, scope: Scope) -> Access:
-        """Return the permissions of a request; raise `ApiError` if they do not suffice."""
+    def require(self, request: web.Request, scope: Scope, *, takes_bearer: bool = False) -> Access:
+        """Return the permissions of a request; raise `ApiError` if they do not suffice.
+
+        takes_bearer: whether a program may send its token in the header Authorization
+        """
         if request.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
             raise ApiError(403, "other-origin", "this request is from a page of another site")
-        access = self.find(request)
+        access = self.find(request, takes_bearer)
         if access.scope is None:
             raise ApiError(
                 401,
                 "not-paired",
                 "this device is not paired",
-                "run 'fishctl window pair' on the fish's computer, and open the link here",
+                "run 'fishctl window token NAME' on the fish's computer, and send what it prints "
+                "as 'Authorization: Bearer TOKEN'"
+                if takes_bearer
+                else "run 'fishctl window pair' on the fish's computer, and open the link here",
             )
         if scope == "drive" and access.scope != "drive":
             raise ApiError(
@@ -161,6 +168,12 @@ def is_loopback(request: web.Request) -> bool:
         return False
     is_name_local = name == "localhost" or is_loopback_address(name)
     return is_name_local and is_loopback_address(request.remote or "")
+
+
+def _read_bearer(request: web.Request) -> str:
+    """Return the token in the header Authorization; empty if there is none."""
+    scheme, _, token = request.headers.get("Authorization", "").partition(" ")
+    return token.strip() if scheme.lower() == "bearer" else ""
 
 
 async def _read_small_body(request: web.Request, kind: type[T]) -> T:

@@ -122,6 +122,11 @@ class FishLink:
         return Connection(self._state, round(age, 2), self._message, self.estop_path.warning)
 
     @property
+    def is_heard(self) -> bool:
+        """Whether ticks arrive, so that `status` is not old."""
+        return self.status is not None and self._state not in ("stale", "lost")
+
+    @property
     def endpoint_options(self) -> list[str]:
         """Options of fishctl for this fish."""
         return [] if self.endpoint is None else ["--endpoint", self.endpoint]

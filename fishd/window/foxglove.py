@@ -17,7 +17,8 @@ from fishd.core.schema import Reading, json_schema, schema_name
 from fishd.core.signals import Event, Status, Tick
 from fishd.window.viewer import Viewer
 
-PROTOCOL = "foxglove.sdk.v1"
+PROTOCOLS = "foxglove.sdk.v1", "foxglove.websocket.v1"
+"""Name of the protocol, and its earlier name, which older viewers ask for; both mean the same."""
 CHANNELS: dict[str, type[Struct]] = {"tick": Tick, "event": Event, "status": Status}
 """Topics, and the types of their messages."""
 MAX_SUBSCRIPTIONS = 100

@@ -14,10 +14,11 @@ from fishd.core import text
 from fishd.window.access import AccessControl
 from fishd.window.answers import answer_in_json
 from fishd.window.fish_requests import FishRequests
-from fishd.window.foxglove import PROTOCOL
+from fishd.window.foxglove import PROTOCOLS
 from fishd.window.job_requests import JobRequests
 from fishd.window.jobs import Jobs
 from fishd.window.live import encode
+from fishd.window.metrics import MetricsRequests
 from fishd.window.pages import Pages
 from fishd.window.paired_devices import PairedDevices
 from fishd.window.register import Register, take_lost_jobs
@@ -58,6 +59,7 @@ class WindowServer(WebServer):
             *access.routes,
             *FishRequests(access, self._pages).routes,
             *JobRequests(access, self._pages, self._jobs).routes,
+            *MetricsRequests(access, self._pages.links, settings.runs_folder).routes,
         ]
         super().__init__(
             host,
@@ -101,7 +103,7 @@ class WindowServer(WebServer):
 
     async def _serve_foxglove(self, request: web.Request) -> web.StreamResponse:
         with self._pages.open_foxglove(request) as page:
-            return await self.serve_viewer(request, page, [PROTOCOL])
+            return await self.serve_viewer(request, page, PROTOCOLS)
 
 
 def _log_failure(run: asyncio.Task[None]) -> None:

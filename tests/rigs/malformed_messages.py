@@ -14,7 +14,7 @@ FRAMES_PER_CONNECTION = 20
 PATHS = (
     "/", "/live", "/foxglove", "/api/session", "/api/pair", "/api/unpair", "/api/fish", "/api/jobs",
     "/api/runs", "/api/fish/fish/drive", "/api/fish/fish/request",
-    "/api/jobs/1/stop", "/api/runs/a/plot.png", "/vendor/manifest.json", "/none",
+    "/api/jobs/1/stop", "/api/runs/a/plot.png", "/vendor/manifest.json", "/metrics", "/none",
 )  # fmt: skip
 BODIES = (
     b"", b"{", b"[]", b"null", b"0", b'"x"', b"{}}", b'{"token":1}', b'{"token":"\xff"}',
@@ -31,6 +31,7 @@ HEADERS = (
     b"Cookie: fishd_window=" + b"z" * 4000, b"Cookie: \xff=\xfe", b"Range: bytes=0-99999999999",
     b"Accept-Encoding: gzip;q=nan", b"Content-Encoding: gzip", b"Origin: null", b" folded: 1",
     b"NoColon", b"X-Client: \x00", b"If-None-Match: *", b"X-Forwarded-For: " + b"1," * 500,
+    b"Authorization: Bearer \xff", b"Authorization: Bearer " + b"z" * 4000, b"Authorization:",
     b"Sec-WebSocket-Version: 0", b"Sec-WebSocket-Extensions: permessage-deflate; x=" + b"1" * 99,
 )  # fmt: skip
 

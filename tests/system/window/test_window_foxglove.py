@@ -3,7 +3,7 @@
 import json
 import struct
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 from xml.etree import ElementTree
 
@@ -14,7 +14,7 @@ from rigs.processes import Daemon, Process
 from rigs.window_process import NETWORK_HOST, Browser, WindowProcess, running_window
 
 from fishd.core.schema import fields_of
-from fishd.window.foxglove import CHANNELS, PROTOCOL
+from fishd.window.foxglove import CHANNELS, PROTOCOLS
 
 LAYOUTS = ROOT / "config" / "layouts"
 LICHTBLICK = "http://lichtblick.example:8080"
@@ -25,12 +25,15 @@ async def read_text(sock: aiohttp.ClientWebSocketResponse) -> dict[str, Any]:
     return message
 
 
-async def test_a_viewer_gets_the_ticks_to_which_it_subscribes(window: WindowProcess) -> None:
+@pytest.mark.parametrize("protocols", [*([name] for name in PROTOCOLS), PROTOCOLS, PROTOCOLS[::-1]])
+async def test_a_viewer_gets_the_ticks_to_which_it_subscribes(
+    window: WindowProcess, protocols: Sequence[str]
+) -> None:
     async with (
         Browser(window.url) as browser,
-        browser.session.ws_connect("/foxglove", protocols=[PROTOCOL]) as sock,
+        browser.session.ws_connect("/foxglove", protocols=protocols) as sock,
     ):
-        assert sock.protocol == PROTOCOL
+        assert sock.protocol == protocols[0]
         info = await read_text(sock)
         assert (info["op"], info["capabilities"]) == ("serverInfo", [])
         channels = {c["topic"]: c for c in (await read_text(sock))["channels"]}
@@ -67,7 +70,7 @@ async def test_a_viewer_gets_the_ticks_to_which_it_subscribes(window: WindowProc
 async def test_a_viewer_can_only_read(window: WindowProcess, message: str) -> None:
     async with (
         Browser(window.url) as browser,
-        browser.session.ws_connect("/foxglove", protocols=[PROTOCOL]) as sock,
+        browser.session.ws_connect("/foxglove", protocols=PROTOCOLS) as sock,
     ):
         await read_text(sock), await read_text(sock)
         await sock.send_str(message)
@@ -111,7 +114,7 @@ async def test_a_program_of_another_machine_reads_once_it_is_paired_until_it_is_
     async with Browser(window.url, NETWORK_HOST) as browser:
         token = window.invite("watch").partition("#pair=")[2]
         await browser.post("/api/pair", {"token": token, "name": "viewer"})
-        async with browser.session.ws_connect("/foxglove", protocols=[PROTOCOL]) as sock:
+        async with browser.session.ws_connect("/foxglove", protocols=PROTOCOLS) as sock:
             assert (await read_text(sock))["op"] == "serverInfo"
             window.ask("revoke", "viewer")
             while not sock.closed:

@@ -48,7 +48,7 @@ async def test_no_name_that_leads_here_but_is_not_ours_gets_anything(
             "Host": authority, "Origin": f"http://{authority}",
             "X-Client": page.hello["client"],
         }  # fmt: skip
-        for path in ("/", "/api/session", "/api/fish"):
+        for path in ("/", "/api/session", "/api/fish", "/metrics"):
             async with browser.session.get(path, headers=headers) as response:
                 assert response.status == 403
         for path, body in CHANGES:
@@ -93,8 +93,9 @@ async def test_another_site_starts_no_reading_either_where_the_browser_tells(
     async with Browser(window.url) as browser:
         for site in ("cross-site", "same-site"):
             headers = {"Sec-Fetch-Site": site}
-            refused = await browser.refusal("/api/runs", headers=headers)
-            assert refused == (403, "other-origin")
+            for path in ("/api/runs", "/metrics"):
+                refused = await browser.refusal(path, headers=headers)
+                assert refused == (403, "other-origin")
 
 
 FORWARDED = [
@@ -111,7 +112,8 @@ async def test_a_browser_behind_a_reverse_proxy_is_not_one_of_this_machine(
     window: WindowProcess, headers: dict[str, str]
 ) -> None:
     async with Browser(window.url) as browser:
-        assert await browser.refusal("/api/fish", headers=headers) == (401, "not-paired")
+        for path in ("/api/fish", "/metrics"):
+            assert await browser.refusal(path, headers=headers) == (401, "not-paired")
     async with Browser(window.url, "fish.example") as browser:
         assert await browser.refusal("/api/fish") == (401, "not-paired")
 
