@@ -237,6 +237,13 @@ class FishLink:
         Where a new fishd does not list its controllers, its next status counts as its first.
         """
         before = self.status
+        if (
+            before
+            and status.pid == before.pid
+            and status.uptime < before.uptime
+            and status.t < before.t
+        ):
+            return before  # this telemetry was overtaken by the answer to a probe
         restarted = before is not None and status.shows_restart_since(before)
         if before is None or restarted:
             self.controllers = await self._monitor.controllers()
