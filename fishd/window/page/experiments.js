@@ -105,8 +105,9 @@ export function Experiments(page) {
     }
   };
   const isEmpty = form.kind === "sweep" ? !form.values.trim() : form.kind === "compare" && !form.contestants.trim();
+  const hasNothing = form.kind === "sweep" && controller && names.length === 0;
   const needs = uses && missing.length > 0;
-  const isReady = Boolean(controller) && !isEmpty && !needs && Boolean(state.session?.paired);
+  const isReady = Boolean(controller) && !isEmpty && !hasNothing && !needs && Boolean(state.session?.paired);
   const { command, problem } = useCheck(state.name, form.kind, isReady ? given(options()) : {}, isReady);
   const total = isReady && command.length ? expected(command) : null;
   const start = (event) => {
@@ -140,7 +141,8 @@ export function Experiments(page) {
         })}
       </div>
       <div id="preview" aria-live="polite">
-        ${needs ? html`<p class="muted">Needed first, in the panel Controller: ${missing.map(({ name }) => name).join(", ")}.</p>`
+        ${hasNothing ? html`<p class="muted">${controller.name} has no number to sweep: choose another controller.</p>`
+          : needs ? html`<p class="muted">Needed first, in the panel Controller: ${missing.map(({ name }) => name).join(", ")}.</p>`
           : isReady && problem ? html`<p class="note">${sentence(problem)}</p>`
             : isReady && command.length > 0 && html`<code tabindex="0" aria-label="Command line to come">${command.map(quote).join(" ")}</code>
               ${total && html`<p class="muted">Takes about ${duration(total)}${form.kind === "simulate" ? " of virtual time" : ""}.</p>`}`}

@@ -415,6 +415,10 @@ def test_a_form_says_at_once_what_its_job_would_refuse(new_window: WindowProcess
         page.select_option("#controller", "thrust")
         expect(page.locator("#preview")).to_contain_text("Needed first")
         expect(start).to_be_disabled()
+        page.select_option("#controller", "ppo")
+        page.click("#tab-sweep")
+        expect(page.locator("#preview")).to_contain_text("ppo has no number to sweep")
+        expect(start).to_be_disabled()
 
 
 def test_a_stored_run_is_opened_and_another_controller_is_run_on_it(
