@@ -116,10 +116,10 @@ def compare(
     else:
         outcome = _swim(run, contestants, settings, runs, camera_config or camera)
     status = _report(outcome, runs or 1, run)
-    if run.picture and outcome.standings:
+    if run.kept_picture and outcome.standings:
         from fishd.lab.compare.figures import draw
 
-        draw(run.picture, outcome.standings, outcome.traces, outcome.amplitude, outcome.unit)
+        draw(run.kept_picture, outcome.standings, outcome.traces, outcome.amplitude, outcome.unit)
     run.check()
     if outcome.error:
         run.ending.end_verb(str(outcome.error), 1)

@@ -9,6 +9,7 @@ them again, with the same noise.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import wraps
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, Self
 
@@ -312,6 +313,13 @@ class Run:
         """Print the folder of the experiment, if there is one."""
         if self._experiment:
             echo(f"folder: {self.folder}")
+
+    @property
+    def kept_picture(self) -> Path | None:
+        """File of the picture: the given one, else one in the folder if the experiment has one."""
+        if self.picture or not self._experiment or find_spec("matplotlib") is None:
+            return self.picture
+        return self.folder / f"{self.kind}.png"
 
     def pictures(self, stem: str) -> list[Path]:
         """Return the files of the picture: the given one, else two in the folder."""

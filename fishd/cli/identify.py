@@ -112,10 +112,10 @@ def identify(
         echo(f"fishctl: careful: {remark}", err=True)
     if target:
         _write_config(target, identification.to_yaml(f"{origin} on {datetime.now():%Y-%m-%d}"))
-    if run.picture:
+    if run.kept_picture:
         from fishd.lab.identification.figure import draw
 
-        draw(identification, run.picture)
+        draw(identification, run.kept_picture)
 
 
 def _parse_names(listed: str) -> tuple[str, ...]:

@@ -41,6 +41,6 @@ async def call(words: list[str], runs: Path) -> bytes:
     process = await spawn(words, runs)
     output, errors = await process.communicate()
     if process.returncode and not output:
-        message = text.line(errors.decode("utf-8", "replace"))
+        message = text.line(errors.decode("utf-8", "replace")).removeprefix("fishctl: ")
         raise JobError(message or f"{shlex.join(words)} failed")
     return output

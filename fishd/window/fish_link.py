@@ -4,8 +4,8 @@ import asyncio
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
-from contextlib import AsyncExitStack, closing, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AsyncExitStack, closing, contextmanager, suppress
 from typing import Any, NamedTuple
 
 import msgspec
@@ -19,6 +19,7 @@ from fishd.core import text
 from fishd.core.addresses import find_control_address
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, LeaseLost
+from fishd.core.protocol import PolicyInfo
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
 from fishd.window.estop_path import EstopPath
 from fishd.window.live import encode_message
@@ -236,6 +237,13 @@ class FishLink:
         Where a new fishd does not list its controllers, its next status counts as its first.
         """
         before = self.status
+        if (
+            before
+            and status.pid == before.pid
+            and status.uptime < before.uptime
+            and status.t < before.t
+        ):
+            return before  # this telemetry was overtaken by the answer to a probe
         restarted = before is not None and status.shows_restart_since(before)
         if before is None or restarted:
             self.controllers = await self._monitor.controllers()
@@ -305,12 +313,23 @@ class FishLink:
         """
         if op == "stop":  # must not wait for a controller that loads
             return _builtins(await self._stopper.stop())
+        with self._waiting_request():
+            async with self._taking:
+                return await self._perform(op, arguments, holder, take, check)
+
+    async def list_policies(self) -> list[PolicyInfo]:
+        """Return the named policies of fishd; raise `FishError`."""
+        with self._waiting_request():
+            return await self._fish.policies()
+
+    @contextmanager
+    def _waiting_request(self) -> Iterator[None]:
+        """Count a request that may wait for this fish; raise `Busy` for one too many."""
         if self._waiting >= MAX_WAITING_REQUESTS:
             raise Busy(f"{self._waiting} requests wait for this fish already; try again later")
         self._waiting += 1
         try:
-            async with self._taking:
-                return await self._perform(op, arguments, holder, take, check)
+            yield
         finally:
             self._waiting -= 1
 

@@ -73,6 +73,7 @@ class FishRequests:
         self._access, self._pages = access, pages
         self.routes = [
             web.get("/api/fish", self._list_fish),
+            web.get("/api/fish/{fish}/policies", self._list_policies),
             web.post("/api/fish/{fish}/estop", self._estop, name=ESTOP),
             web.post("/api/fish/{fish}/drive", self._drive),
             web.post("/api/fish/{fish}/release", self._release),
@@ -87,6 +88,10 @@ class FishRequests:
                 for link in self._pages.links.values()
             ]
         )
+
+    async def _list_policies(self, request: web.Request) -> web.Response:
+        self._access.require(request, "watch")
+        return success(await self._pages.find_link(request.match_info["fish"]).list_policies())
 
     async def _estop(self, request: web.Request) -> web.Response:
         access = self._access.require(request, "watch")

@@ -13,8 +13,8 @@ from fishd.core.signals import ControllerInfo
 from fishd.core.swim_plan import plan
 from fishd.window.access import AccessControl
 from fishd.window.answers import ApiError, NoArguments, convert, read_body, success
-from fishd.window.fish_link import Busy
-from fishd.window.job_options import DRIVING_KINDS, KINDS, MEASURED_KINDS
+from fishd.window.fish_link import Busy, FishLink
+from fishd.window.job_options import DRIVING_KINDS, KINDS, MEASURED_KINDS, list_words
 from fishd.window.jobs import Jobs
 from fishd.window.pages import Pages
 
@@ -39,7 +39,9 @@ class JobRequests:
         self.routes = [
             web.get("/api/jobs", self._list_jobs),
             web.post("/api/jobs", self._start_job),
+            web.post("/api/jobs/check", self._check_job),
             web.post("/api/jobs/{job}/stop", self._stop_job),
+            web.post("/api/jobs/{job}/dismiss", self._dismiss_job),
             web.get("/api/runs", self._list_runs),
             web.get("/api/runs/{run}/plot.png", self._plot_run),
         ]
@@ -59,10 +61,10 @@ class JobRequests:
         self._access.require(request, "watch")
         return success(self._jobs.all())
 
-    async def _start_job(self, request: web.Request) -> web.Response:
-        access = self._access.require(request, "drive")
+    async def _read_job(self, request: web.Request) -> tuple[JobRequest, FishLink, Any]:
+        """Return the job that a page wants, its fish, and its options; raise `ApiError`."""
         body = await read_body(request, JobRequest)
-        link, page = self._pages.find_link(body.fish), self._pages.find_page(request, access)
+        link = self._pages.find_link(body.fish)
         if body.kind not in KINDS:
             message = f"no such kind '{text.quoted(body.kind)}'; valid: {', '.join(KINDS)}"
             raise ApiError(400, "unknown-kind", message)
@@ -70,7 +72,23 @@ class JobRequests:
         if getattr(options, "parameters", None):
             _check_parameters(options, link.controllers)
         if body.kind in MEASURED_KINDS:
-            _check_length(body.kind, options)
+            _check_length(options)
+        return body, link, options
+
+    async def _check_job(self, request: web.Request) -> web.Response:
+        """Answer with the command line of a job, and what is wrong with it; start nothing."""
+        self._access.require(request, "watch")
+        try:
+            body, _, options = await self._read_job(request)
+        except ApiError as error:
+            return success({"command": [], "problem": str(error)})
+        words = [body.kind] if body.kind == "resume" else list_words(body.kind, options)
+        return success({"command": ["fishctl", *words], "problem": ""})
+
+    async def _start_job(self, request: web.Request) -> web.Response:
+        access = self._access.require(request, "drive")
+        body, link, options = await self._read_job(request)
+        page = self._pages.find_page(request, access)
 
         def check() -> None:
             self._access.require(request, "drive")
@@ -91,6 +109,13 @@ class JobRequests:
         await read_body(request, NoArguments)
         return success(self._jobs.stop(request.match_info["job"]))
 
+    async def _dismiss_job(self, request: web.Request) -> web.Response:
+        self._access.require(request, "drive")
+        await read_body(request, NoArguments)
+        job = self._jobs.dismiss(request.match_info["job"])
+        self._pages.tell_job(job)
+        return success(job)
+
     async def _list_runs(self, request: web.Request) -> web.Response:
         self._access.require(request, "watch")
         with self._waiting_for_disk():
@@ -103,12 +128,12 @@ class JobRequests:
         return web.Response(body=picture, content_type="image/png")
 
 
-def _check_length(kind: str, options: Any) -> None:
+def _check_length(options: Any) -> None:
     """Raise `ApiError` if the time is too short or too long for a measurement."""
     try:
         plan(options.seconds, getattr(options, "parameters", {}))
     except ParameterError as error:
-        raise ApiError(400, "bad-arguments", f"{kind}: {error}") from None
+        raise ApiError(400, "bad-arguments", str(error)) from None
 
 
 def _check_parameters(options: Any, controllers: Collection[ControllerInfo]) -> None:

@@ -6,7 +6,6 @@ window that was killed is among the jobs of its successor.
 
 import asyncio
 import os
-import shutil
 import signal
 import time
 from collections.abc import Callable, Iterable, Set
@@ -50,8 +49,8 @@ class Job(Struct):
     fish: str
     command: list[str]
     """Words that a person would type."""
-    state: Literal["running", "done", "failed", "stopped", "lost"]
-    """`lost`: its window was killed."""
+    state: Literal["running", "done", "failed", "stopped", "lost", "dismissed"]
+    """`lost`: its window was killed; `dismissed`: it is no longer listed."""
     elapsed: float
     """Time since its start, until its end at most [s]."""
     run: str = ""
@@ -248,7 +247,7 @@ class Jobs:
         if job.kind == "simulate":
             return [f"--record={self._recording_of(job)}", "--json"]
         place = [] if is_resumed else ["--on=live", f"--folder={self._folder / job.run}"]
-        return [*place, f"--plot={self._scratch}/{job.id}.png", "--json"]
+        return [*place, "--json"]
 
     def _recording_of(self, job: Job) -> Path:
         """Return the path of the recording of a simulated fish."""
@@ -259,9 +258,7 @@ class Jobs:
 
     def stop(self, name: str) -> Job:
         """Interrupt a job as Ctrl-C does: an experiment lets the fish rest first."""
-        job = self._jobs.get(name)
-        if job is None:
-            raise JobError(f"there is no job '{text.quoted(name)}'")
+        job = self._find(name)
         if name in self._tasks and name not in self._stopping:
             self._stopping.add(name)
             self._signal(name, signal.SIGINT)
@@ -269,6 +266,19 @@ class Jobs:
             loop.call_later(STOP_TIMEOUT_S, self._signal, name, signal.SIGTERM)
             loop.call_later(2.0 * STOP_TIMEOUT_S, self._signal, name, signal.SIGKILL)
         return job
+
+    def dismiss(self, name: str) -> Job:
+        """Remove a job that has ended from the list; its run is kept; raise `JobError`."""
+        job = self._find(name)
+        if job.state == "running":
+            raise JobError("this job runs; stop it first")
+        job.state = "dismissed"
+        return self._jobs.pop(name)
+
+    def _find(self, name: str) -> Job:
+        if job := self._jobs.get(name):
+            return job
+        raise JobError(f"there is no job '{text.quoted(name)}'")
 
     def stop_without_access(self, paired: Set[str]) -> None:
         """Stop the jobs of devices that are not among the paired ones, by their identifiers."""
@@ -290,7 +300,6 @@ class Jobs:
             if job.kind == "simulate" and job.exit == 0:
                 curve = await read_curve(self._recording_of(job), self._folder)
                 job.result = {**job.result, "curve": curve}
-            await asyncio.to_thread(self._keep_picture, job)
             stopped = job.id in self._stopping
             await asyncio.to_thread(self._conclude, job)
             job.state = "stopped" if stopped else "done" if job.exit == 0 else "failed"
@@ -306,14 +315,6 @@ class Jobs:
             self.runs.forget()
             self._keep_running()
             self._tell(job)
-
-    def _keep_picture(self, job: Job) -> None:
-        """Move the picture of an experiment into its folder."""
-        if not job.run:
-            return
-        picture, folder = self._scratch / f"{job.id}.png", self._folder / job.run
-        if picture.exists() and folder.is_dir():
-            shutil.move(picture, folder / f"{job.kind}.png")
 
     async def _run_child(self, job: Job, words: list[str]) -> bytes:
         """Run fishctl; return its output."""

@@ -22,7 +22,7 @@ def open_run_picture(runs: Path, run: str) -> BinaryIO:
         with os.scandir(place) as entries:
             name = min((entry.name for entry in entries if entry.name.endswith(".png")), default="")
         if not name:
-            raise NoFile(f"'{run}' has no picture: one is drawn at the end of an experiment")
+            raise NoFile(f"'{run}' has no picture")
         return open_picture(Path(name), f"'{run}/{name}'", place)
     finally:
         os.close(place)

@@ -1,10 +1,11 @@
 """Runs: the recordings and experiments of a folder, their pictures, and what an end left of one."""
 
 import asyncio
-import os
+import glob
 import re
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -38,12 +39,12 @@ class Runs:
     """The runs of a folder; use it in one event loop."""
 
     def __init__(self, folder: Path, scratch: Path) -> None:
-        """scratch: folder for pictures of recordings"""
+        """scratch: folder for pictures that are drawn on request"""
         self.folder, self._scratch = folder, scratch
         self._list: tuple[float, Any] = (-RUNS_AGE_S, [])
         self._listing, self._plotting = asyncio.Lock(), asyncio.Lock()
-        self._drawn: dict[str, tuple[int, ...] | None] = {}
-        """Stamp of each recording when its picture was drawn."""
+        self._drawn: dict[str, list[tuple[str, int, int]]] = {}
+        """Stamp of each run when its picture was drawn."""
 
     def forget(self) -> None:
         """Read the folder again when it is listed next."""
@@ -77,26 +78,25 @@ class Runs:
             raise JobError(f"the runs in {self.folder} could not be listed") from None
 
     async def plot(self, name: str) -> BinaryIO:
-        """Return the picture of a recording, or of an experiment, open; raise `JobError`."""
+        """Return the picture of a run, open; draw it if it has none; raise `JobError`."""
         if not _RUN_NAME.fullmatch(name):
             raise JobError(f"'{text.quoted(name)}' is not the name of a run")
         try:
-            if await asyncio.to_thread(os.path.lexists, self.folder / name):
+            with suppress(files.NoFile):
                 return await asyncio.to_thread(open_run_picture, self.folder, name)
             return await self._draw(name)
         except files.FileProblem as problem:
             raise JobError(str(problem)) from None
 
     async def _draw(self, name: str) -> BinaryIO:
-        """Return the picture of a recording, which is drawn if there is none; raise `JobError`."""
+        """Return a picture of a run that is drawn here, again if it has changed."""
         try:
             async with self._plotting:
                 picture = self._scratch / f"{name}.png"
-                stamp = await asyncio.to_thread(_read_stamp, self.folder / f"{name}.mcap")
-                if stamp is None or stamp != self._drawn.get(name):
-                    where = (f"--folder={self.folder}", f"--to={self._scratch}")
-                    words = ["plot", name, "--force", *where, "--json"]
-                    await call(words, self.folder)
+                stamp = await asyncio.to_thread(_read_stamp, self.folder, name)
+                if not stamp or stamp != self._drawn.get(name):
+                    where = (f"--folder={self.folder}", f"--to={picture}")
+                    await call(["plot", name, "--force", *where, "--json"], self.folder)
                     self._drawn[name] = stamp
                 return await asyncio.to_thread(open_picture, picture, f"the picture of {name}")
         except files.NoFile:
@@ -112,10 +112,10 @@ def _is_empty(folder: Path) -> bool:
         return False
 
 
-def _read_stamp(file: Path) -> tuple[int, ...] | None:
-    """Return a stamp that changes with the file and its content; None without a file."""
-    try:
-        status = file.stat()
-    except OSError:
-        return None
-    return status.st_ino, status.st_size, status.st_mtime_ns
+def _read_stamp(folder: Path, name: str) -> list[tuple[str, int, int]]:
+    """Return what changes with the files of a run: name, size and time of each."""
+    paths = [*folder.glob(f"{glob.escape(name)}.mcap*"), *(folder / name).glob("*")]
+    with suppress(OSError):
+        stats = [(path.name, path.stat()) for path in sorted(paths)]
+        return [(name, status.st_size, status.st_mtime_ns) for name, status in stats]
+    return []

@@ -12,10 +12,16 @@ from msgspec.structs import asdict
 from fishd.cli.options import F, FiniteRange, json_option
 from fishd.cli.output import echo, format_count, print_json, print_json_line, print_paths
 from fishd.cli.verbs import pause_garbage_collector
+from fishd.core import files
 from fishd.core.addresses import control_address, find_control_address
 from fishd.core.process.interruption import raise_on_first_signal
 from fishd.recording import Run, open_run
-from fishd.recording.folder import FOLDER_VARIABLE, check_new_files, find_recording
+from fishd.recording.folder import (
+    FOLDER_VARIABLE,
+    check_new_files,
+    find_recording,
+    runs_folder,
+)
 from fishd.recording.reader import RECOVERED
 
 folder_option = click.option(
@@ -124,11 +130,23 @@ def plot(
 ) -> None:
     """Draw forces, command, thrust, the controller's own quantities, and a phase portrait.
 
-    RUN is a path, a name in the folder of recordings, or 'latest'.
+    RUN is a path, a name in the folder of recordings, or 'latest'. Of an experiment, its last
+    recording is drawn; of a measurement, its drift and its thrust; of a training, its progress.
     """
+    from fishd.lab.experiment import HEADER
     from fishd.lab.run_figure import draw_run
     from fishd.lab.run_traces import traces
 
+    experiment = files.expand_user(run) if "/" in run else (folder or runs_folder()) / run
+    if (experiment / HEADER).is_file():
+        if begin or end is not None:
+            raise click.UsageError("--from and --until are for a recording, not an experiment")
+        path = target or experiment
+        path = path / f"{experiment.name}.png" if path.is_dir() else path
+        check_new_files([path], replace=force)
+        _draw_experiment(experiment, path)
+        print_paths([path], as_json)
+        return
     recorded = open_recording(run, folder)
     run_traces = traces(recorded, begin, math.inf if end is None else end)
     path = target or recorded.path.parent
@@ -136,6 +154,21 @@ def plot(
     check_new_files([path], replace=force)
     draw_run(run_traces, path)
     print_paths([path], as_json)
+
+
+def _draw_experiment(folder: Path, path: Path) -> None:
+    from fishd.lab.experiment import read_header
+
+    header = read_header(folder)
+    if header.kind != "learn ppo":
+        from fishd.lab import experiment_figure
+
+        experiment_figure.draw(folder, header, path)
+        return
+    from fishd.learning.run_folder import figure
+    from fishd.learning.run_folder.tables import SEEDS
+
+    (figure.draw_seeds if (folder / SEEDS).exists() else figure.draw)(path, folder)
 
 
 @click.command()

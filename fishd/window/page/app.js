@@ -1,13 +1,15 @@
 // The page: its state, what the stream says about it, the header with the E-stop, and the values.
 import {
-  call, duration, forceUnit, html, interval, number, parametersText, recall, remember, render, sentence, setClient,
-  significant, timeOfDay, unitText, useState,
+  call, duration, forceUnit, html, number, parametersText, recall, remember, render, sentence, setClient, timeOfDay, useState,
 } from "./common.js";
 import { Charts } from "./charts.js";
-import { defaultOf, Drive, driverName, request, selectionOf } from "./controls.js";
-import { Experiments, plain, Runs } from "./experiments.js";
+import { Drive, driverName, request } from "./controls.js";
+import { Experiments, plain, triedThrust } from "./experiments.js";
+import { defaultOf } from "./fields.js";
 import { TopView } from "./fish.js";
+import { Runs } from "./runs.js";
 import { Ring, Stream, ticksOf } from "./stream.js";
+import { Health, thrustTexts, Values } from "./values.js";
 
 const byId = (id) => document.getElementById(id);
 const STALE_S = 0.8;
@@ -27,6 +29,8 @@ const MAX_EVENTS = 100;
 /** Beginning of the name of the lease under which a page drives. */
 const OWN_LEASE = "window: ";
 const WINDOWS = [15, 30, 60, 120];
+/** Parts of the page, by the last part of its address. */
+const PLACES = { live: "Live", experiments: "Experiments", runs: "Runs", fish: "Fish" };
 
 const state = {
   name: "", fish: [], session: null, status: null, controllers: [], events: [], jobs: new Map(),
@@ -113,11 +117,11 @@ const receive = {
   },
   job(job) {
     const before = state.jobs.get(job.id);
-    state.jobs.set(job.id, job);
+    if (job.state === "dismissed") state.jobs.delete(job.id);
+    else state.jobs.set(job.id, job);
     if (before?.state === "running" && job.state !== "running") {
       notice(job.state === "failed" ? "error" : "info", `${job.kind}: ${job.state}`, job.state === "failed" ? plain(job.lines?.at(-1) ?? "") : "");
     }
-    showVirtual(job);
     changed();
   },
   driver(driver) {
@@ -183,12 +187,6 @@ function noticeOther(event) {
   if (state.own.has(JSON.stringify([controller, parameters])) || experimentOf(state.status)) return;
   if (event.kind === "fallback") notice("warning", event.message);
   else notice("warning", `Another client set ${controller} ${ownText(controller, parameters)}`.trim() + ".");
-}
-
-function showVirtual(job) {
-  if (job.kind !== "simulate" || job.state !== "done" || !Number.isFinite(job.result?.mean_thrust)) return;
-  if (forceUnit(state.status)[1] !== "mN") return;
-  charts.showVirtual(`${job.result.controller} ${ownText(job.result.controller, job.result.parameters)}`.trim(), job.result);
 }
 
 // ---- how fresh it is: by this page's own clock, whatever the server says ----
@@ -353,6 +351,7 @@ function Head() {
   const { kind, age, message } = freshness();
   const mode = state.status?.mode ?? "unknown", modeText = mode === "estop" ? "E-stop" : mode;
   const lease = experimentOf(state.status);
+  const [thrust, error, unit] = thrustTexts(state);
   const driver = lease ? `${lease.name} drives` : state.driver ? (state.driver.you_drive ? "you drive" : `${driverName(state)} drives`) : "no driver";
   return html`
     ${state.fish.length > 1
@@ -362,7 +361,8 @@ function Head() {
     ${kind !== "not paired" && html`<span class=${`pill mode ${mode}`} id="mode">${kind === "lost" && state.status ? `was ${modeText}` : modeText}</span>`}
     <span class=${`pill connection ${kind}`} id="connection" title=${message ?? ""}>
       <span class="dot"></span>${kind === "live" ? "live" : kind} <span class="age">${kind === "connecting" || kind === "not paired" ? "" : Number.isFinite(age) ? duration(age) : "no tick yet"}</span></span>
-    ${kind !== "not paired" && html`<span class="driver" id="driver">${driver}</span>`}`;
+    ${kind !== "not paired" && html`<span id="thrust" title="Thrust, with its 95 % interval"><b>${thrust}</b> ${error} ${unit}</span>
+      <span class="driver" id="driver">${driver}</span>`}`;
 }
 
 function Banner() {
@@ -373,7 +373,7 @@ function Banner() {
   const reason = status?.reason;
   const latched = mode === "estop" || mode === "fault";
   return html`
-    ${session && session.paired === false && html`<${Pairing} />`}
+    ${(session?.paired === false || state.invitation) && html`<${Pairing} />`}
     ${warning && html`<div class="banner warn" id="unreachable"><b>The E‑stop may not reach the fish.</b>
       <span>To stop it now, use the button of the panel, or run fishctl estop on its computer. ${sentence(warning)}${isOld && " What is greyed is old."}</span></div>`}
     ${isOld && !warning && html`<div class="banner warn"><b>${kind === "lost" ? "Connection lost." : "Stale."}</b>
@@ -399,37 +399,27 @@ function Banner() {
 }
 
 function Pairing() {
-  const [token, setToken] = useState(""), [name, setName] = useState("");
+  const { invitation } = state;
+  const [typed, setToken] = useState(""), [name, setName] = useState(""), token = invitation || typed;
   const send = async (event) => {
     event.preventDefault();
     await pair(token.trim(), name.trim());
   };
   return html`<form class="banner pairing" onSubmit=${send}>
-    <b>This device is ${state.helloed ? "no longer" : "not"} paired.</b><span>Run fishctl window pair on the fish's computer, then open its link here, or type its last part, after #pair=.</span>
-    <label>Code <input value=${token} required autocomplete="one-time-code" onInput=${(event) => setToken(event.target.value)} /></label>
-    <label>Name of this device <input value=${name} placeholder="tablet" maxlength="40" onInput=${(event) => setName(event.target.value)} /></label>
+    <b>${invitation ? "Pair this device." : `This device is ${state.helloed ? "no longer" : "not"} paired.`}</b>
+    <span>${invitation ? "Give it a name: by that it is listed, and revoked." : "Run fishctl window pair on the fish's computer, then open its link here, or type its last part, after #pair=."}</span>
+    ${!invitation && html`<label>Code <input value=${token} required autocomplete="one-time-code" onInput=${(event) => setToken(event.target.value)} /></label>`}
+    <label>Name of this device <input value=${name} required placeholder="tablet at the tank" maxlength="40" autocomplete="off" onInput=${(event) => setName(event.target.value)} /></label>
     <button class="primary">Pair</button></form>`;
 }
 
 async function pair(token, name) {
   try {
-    await call("POST", "/api/pair", { token, name: name || "browser" });
+    await call("POST", "/api/pair", { token, name });
     location.reload();
   } catch (error) {
     notice("error", error.message, error.remedy);
   }
-}
-
-function Card({ title, value, extra = "", unit = "", note = "", level = "", children }) {
-  return html`<div class=${`card ${level}`}><h3>${title}</h3>
-    <p class="big"><span>${value}</span> <small>${extra} ${unit}</small></p><p class="sub">${note && html`<span>${note}</span>`}${children}</p></div>`;
-}
-
-/** Return the largest value of a column in the last second. */
-function largest(name) {
-  const recent = new Array(Math.max(1, Math.ceil(1 / ring.period))).fill(null);
-  ring.copy(name, recent);
-  return recent.reduce((most, value) => (value !== null && !(value <= most) ? value : most), NaN);
 }
 
 function setReference() {
@@ -438,35 +428,6 @@ function setReference() {
   state.reference = { thrust, half, text: `${controller} ${timeOfDay(state.tick.t)}` };
   remember(`reference.${state.name}`, state.reference);
   return changed();
-}
-
-function Values() {
-  const { tick, status, reference } = state;
-  const [factor, unit] = forceUnit(status);
-  const half = tick?.thrust_ci95;
-  const [thrust, error] = interval(tick?.thrust * factor, half == null ? NaN : half * factor);
-  const ratio = reference ? tick?.thrust / reference.thrust : NaN;
-  const ratioHalf = Math.abs(ratio) * Math.hypot((half ?? NaN) / tick?.thrust, (reference?.half ?? NaN) / reference?.thrust);
-  const [relative, relativeError] = interval(100 * ratio, 100 * ratioHalf);
-  const age = largest("sample_age_ms"), late = largest("lateness_us") / 1000, period = ring.period * 1000;
-  return html`
-    <${Card} title="Thrust" value=${thrust} extra=${error} unit=${unit}
-      note=${!tick ? "" : half == null ? "mean F_x: the zero is unknown" : tick.mode === "running" ? "mean of whole beats" : "at rest"} />
-    <${Card} title="Tail beat" value=${tick?.frequency ? number(tick.frequency, 2) : "–"} unit=${tick?.frequency ? "Hz" : ""} note=${tick?.frequency ? `${number(60 * tick.frequency, 0)} a minute` : tick && "no beats"} />
-    ${tick?.speed !== undefined && html`<${Card} title="Speed" value=${number(1000 * tick.speed, 1)} unit="mm/s" note="true speed of the simulated fish" />`}
-    <${Card} title="Relative thrust" value=${relative} extra=${relativeError} unit=${reference ? "%" : ""} note=${reference?.text ?? ""}>
-      <button type="button" class="link" disabled=${!tick} onClick=${setReference}>${reference ? "again" : "take this as 100 %"}</button><//>
-    ${Object.entries(status?.readings ?? {}).map(([name, reading]) => html`<${Card} key=${name} title=${sentence(name.replaceAll("_", " ")).slice(0, -1)}
-      value=${significant(reading.value ?? NaN, 4)} unit=${reading.value == null ? "" : unitText(reading.unit)}
-      level=${reading.problem ? "warn" : ""} note=${reading.problem ?? "mean of 2 s"} />`)}
-    <${Card} title="Controller" value=${status ? (status.mode === "running" ? status.controller : "none") : "–"}
-      note=${status ? (status.mode === "running" ? ownText(status.controller, status.parameters) || "default parameters" : status.servo_on ? "servo at neutral" : "servo without pulses") : ""} />
-    <${Card} title="Sensor age" value=${number(age, 1)} unit="ms" level=${age > 2 * period ? "warn" : ""}
-      note=${tick?.suspect ? `suspect: ${tick.suspect}` : "largest of 1 s"} />
-    <${Card} title="Tick lateness" value=${number(late, 2)} unit="ms" level=${late > 0.5 * period ? "warn" : ""}
-      note=${status && `${status.overruns} overruns, ${status.missed_slots} missed`} />
-    <${Card} title="Tick" value=${tick ? `#${tick.seq}` : "–"} level=${ring.lost ? "warn" : ""}
-      note=${ring.lost ? `${ring.lost} lost on the way in 2 min` : tick && "none lost in 2 min"} />`;
 }
 
 function Events() {
@@ -489,11 +450,19 @@ const Notices = () => state.notices.map((one) => html`<div key=${one.id} class=$
   <button type="button" aria-label="Dismiss" onClick=${() => dismiss(one.id)}>×</button></div>`);
 
 const renderHead = () => render(html`<${Head} />`, byId("head"));
-const renderValues = () => render(html`<${Values} />`, byId("cards"));
+const renderValues = () => (state.place === "fish" ? render(html`<${Health} state=${state} ring=${ring} />`, byId("health"))
+  : state.place === "live" && render(html`<${Values} ...${{ state, ring, ownText, setReference }} />`, byId("cards")));
+
+function Places() {
+  const running = [...state.jobs.values()].filter((job) => job.state === "running").length;
+  return Object.entries(PLACES).map(([place, title]) => html`<a href=${`#${place}`} aria-current=${place === state.place ? "page" : undefined}>${title}
+    ${place === "experiments" && running > 0 && html` <span class="pill small running">${running}</span>`}</a>`);
+}
 
 function renderAll() {
   const shared = { state, act, notice, changed, changeRole, becomeDriver, experiment: experimentOf(state.status) };
   renderHead();
+  render(html`<${Places} />`, byId("places"));
   renderValues();
   render(html`<${Banner} />`, byId("banner"));
   render(html`<${Drive} ...${shared} />`, byId("drive"));
@@ -531,8 +500,9 @@ function drawFrame(now) {
     saidMode = mode;
     say(`Mode ${mode}.`);
   }
+  charts.setVirtual(triedThrust(state));
   charts.draw(now);
-  view.draw(state.tick);
+  if (state.place === "live") view.draw(state.tick);
   const tail = !state.tick ? "tail" : state.tick.alpha === undefined ? "tail, as commanded" : "tail, true";
   if (byId("tail-key").textContent !== tail) byId("tail-key").textContent = tail;
   if (charts.dirty) schedule();
@@ -553,27 +523,37 @@ function buildStaticParts() {
       schedule();
     }}>${WINDOWS.map((seconds) => html`<option value=${seconds}>${seconds} s</option>`)}</select></label></div>
     <div id="plots"></div>`, section);
-  const banner = byId("banner");
-  new ResizeObserver(() => document.documentElement.style.setProperty("--banner", `${banner.offsetHeight}px`)).observe(banner);
+  const banner = byId("banner"), header = document.querySelector("header");
+  const noteHeights = new ResizeObserver(() => {
+    document.documentElement.style.setProperty("--banner", `${banner.offsetHeight}px`);
+    document.documentElement.style.setProperty("--header", `${header.offsetHeight}px`);
+  });
+  noteHeights.observe(banner);
+  noteHeights.observe(header);
   charts = new Charts(byId("plots"), state.seconds);
   charts.setRing(ring);
 }
 
-/** Pair with the token in the address, and remove it from there; return whether there is one. */
-function pairByAddress() {
+/** Show the place in the address; take the token of an invitation from there, for which the page asks a name. */
+function followAddress() {
   const token = new URLSearchParams(location.hash.slice(1)).get("pair");
-  if (!token) return false;
-  history.replaceState(null, "", location.pathname + location.search);
-  pair(token, "");
-  return true;
+  if (token) {
+    state.invitation = token;
+    history.replaceState(null, "", location.pathname + location.search);
+  }
+  const place = PLACES[location.hash.slice(1)] ? location.hash.slice(1) : "live";
+  state.place = place;
+  for (const section of byId("main").children) section.hidden = !section.dataset.places.split(" ").includes(place);
+  byId("main").dataset.place = place;
+  changed();
 }
 
 async function start() {
   buildStaticParts();
   renderAll();
   setInterval(checkConnection, CHECK_MS);
-  addEventListener("hashchange", pairByAddress);
-  if (pairByAddress()) return;
+  addEventListener("hashchange", followAddress);
+  followAddress();
   for (;;) {
     try {
       state.session = await call("GET", "/api/session");

@@ -92,7 +92,6 @@ class Chart {
     this.unit = definition.unit ?? "";
     this.setTitle(definition.title);
     for (const { name, stroke, column } of definition.series) if (name) this.#key(name, stroke, column);
-    if (definition.close) this.#closeButton();
     this.data = [owner.times, ...definition.series.map(() => owner.newColumn())];
     this.plot = new globalThis.uPlot(this.#options(), this.data, this.plotNode);
     this.plot.setScale("x", { min: -owner.seconds, max: 0 });
@@ -148,15 +147,6 @@ class Chart {
     this.readout.value = value == null ? "–" : number(value, Math.max(0, 2 - Math.floor(Math.log10(max - min))));
   }
 
-  #closeButton() {
-    const button = this.titleNode.parentNode.appendChild(document.createElement("button"));
-    button.type = "button";
-    button.className = "link";
-    button.textContent = "close";
-    button.setAttribute("aria-label", "Close the virtual result");
-    button.addEventListener("click", this.definition.close);
-  }
-
   #key(name, stroke, column) {
     const key = this.keys.appendChild(document.createElement("span"));
     key.dataset.column = column;
@@ -175,8 +165,8 @@ class Chart {
       padding: [definition.labelled ? 15 : 6, 16, 0, 0],
       pxAlign: 1,
       legend: { show: false },
-      cursor: { ...(definition.close ? {} : { sync: { key: "fish", setSeries: false } }), drag: { x: false, y: false }, points: { size: 6 } },
-      scales: { x: { time: false, auto: false }, y: { range: definition.range ?? steadyRange(() => this.factor * (definition.smallest ?? 1e-3), () => definition.limits && owner.limits) } },
+      cursor: { sync: { key: "fish", setSeries: false }, drag: { x: false, y: false }, points: { size: 6 } },
+      scales: { x: { time: false, auto: false }, y: { range: steadyRange(() => this.factor * (definition.smallest ?? 1e-3), () => definition.limits && owner.limits) } },
       axes: [
         {
           ...axis, size: 22, gap: 2,
@@ -284,7 +274,6 @@ export class Charts {
       title: [""], series: [line("", "fin")],
     }, this));
     for (const chart of this.namedCharts) chart.show(false);
-    this.#makeVirtualChart();
     this.all = [...this.charts, ...this.namedCharts];
     this.drawn = 0;
     this.dirty = true;
@@ -315,7 +304,6 @@ export class Charts {
     this.length = Math.min(this.ring.capacity, Math.ceil(seconds / this.ring.period) + 64);
     this.times = this.newColumn();
     for (const chart of this.all) chart.data = [this.times, ...chart.definition.series.map(() => this.newColumn())];
-    this.#drawVirtual();
     this.dirty = true;
   }
 
@@ -388,39 +376,11 @@ export class Charts {
     }
   }
 
-  #makeVirtualChart() {
-    const owner = { times: [0, 1], newColumn: () => [null, null], secondsBack: () => this.secondsBack(), seconds: this.seconds, gaps: [], marks: [] };
-    const [live] = this.charts;
-    const range = (plot, least, most) => {
-      const { min, max } = live.plot.scales.y;
-      return Number.isFinite(least) ? [Math.min(least, min), Math.max(most, max)] : [min, max];
-    };
-    this.virtualChart = new Chart(this.parent, {
-      title: ["Virtual F", "x"], range, close: () => this.showVirtual("", null),
-      series: [line("fx", "virtual", { width: 1 }), line("thrust", "virtual", { width: 2 })],
-    }, owner);
-    this.virtualChart.show(false);
-    live.root.after(this.virtualChart.root);
-  }
-
-  /** Draw a simulated run beside the live force, and its mean thrust in the chart of the thrust. */
-  showVirtual(text, result) {
-    const chart = this.virtualChart, curve = result?.curve;
-    this.virtual = result?.mean_thrust ?? null;
+  /** Draw the thrust of a simulated fish, which may be null, in the chart of the thrust [N]. */
+  setVirtual(thrust) {
+    if (thrust === this.virtual) return;
+    this.virtual = thrust;
     this.dirty = true;
-    chart.show(Boolean(curve));
-    if (!curve) return;
-    const milli = (column) => column.map((value) => (value === null ? null : 1000 * value));
-    chart.unit = "mN";
-    chart.setTitle([`${text}: virtual F`, "x"]);
-    chart.data = [curve.time, milli(curve.fx), milli(curve.thrust)];
-    chart.size();
-    this.#drawVirtual();
-  }
-
-  #drawVirtual() {
-    const chart = this.virtualChart, last = chart.data[0].at(-1);
-    if (!chart.root.hidden) chart.draw(last - this.seconds, last);
   }
 
   #findGaps() {

@@ -1,6 +1,7 @@
-// Experiments as child processes of the server, with the command line that each ran, and kept runs.
-import { call, controllerText, duration, fetchPicture, forceUnit, html, interval, number, numberIn, recall, remember, sentence, useEffect, useState } from "./common.js";
-import { defaultOf, selectionOf, shownParameters } from "./controls.js";
+// Experiments as child processes of the server: a form, and the jobs with the command line that each ran.
+import { call, controllerText, duration, forceUnit, html, interval, number, numberIn, recall, remember, sentence, useEffect, useState } from "./common.js";
+import { Curve } from "./curve.js";
+import { defaultOf, missingOf, selectionOf, shownParameters } from "./fields.js";
 
 const KINDS = {
   measure: { title: "Measure", text: "Swims and rests in turn; thrust with its 95 % interval." },
@@ -10,6 +11,9 @@ const KINDS = {
   simulate: { title: "Try first", text: "Swims a simulated fish in virtual time; the real one rests." },
 };
 
+/** Pause after an entry until the server is asked about it. */
+const CHECK_MS = 200;
+
 /** Return an input with its label; `set` gets its text. */
 const input = (label, value, set, more = {}) => html`<label class="row"><span>${label}</span>
   <input value=${value} autocomplete="off" onInput=${(event) => set(event.target.value)} ...${more} /></label>`;
@@ -18,7 +22,7 @@ const input = (label, value, set, more = {}) => html`<label class="row"><span>${
 const DRIVING = ["measure", "sweep", "compare", "resume"];
 
 /** Start a job; take the driver's role first where it needs it. Say why it was refused, and offer to take the fish. */
-async function startJob({ state, notice, changed, becomeDriver }, kind, options, take = false) {
+export async function startJob({ state, notice, changed, becomeDriver }, kind, options, take = false) {
   const drives = DRIVING.includes(kind);
   try {
     if (drives && (take || !state.driver?.you_drive)) await becomeDriver(take);
@@ -33,19 +37,45 @@ async function startJob({ state, notice, changed, becomeDriver }, kind, options,
 }
 
 /** Return the half-width of a thrust's interval, with the calibration where that is known. */
-const halfWidthOf = ({ thrust_ci95: statistical, total_ci95: total }) => total ?? statistical;
+export const halfWidthOf = ({ thrust_ci95: statistical, total_ci95: total }) => total ?? statistical;
+
+/** Return the thrust of the newest simulated fish among the jobs [N]; null without one, or where the true force is in another unit. */
+export function triedThrust({ jobs, status }) {
+  const tried = [...jobs.values()].filter(({ kind, state }) => kind === "simulate" && state === "done").at(-1)?.result.mean_thrust;
+  return Number.isFinite(tried) && forceUnit(status)[1] === "mN" ? tried : null;
+}
+
+/** Return the command line of a job and what is wrong with it, both as the server says. */
+function useCheck(fish, kind, options, isReady) {
+  const [answer, setAnswer] = useState({ command: [], problem: "" });
+  const body = JSON.stringify({ fish, kind, options });
+  useEffect(() => {
+    if (!isReady) return undefined;
+    let isOld = false;
+    const timer = setTimeout(() => call("POST", "/api/jobs/check", JSON.parse(body)).then(
+      (checked) => isOld || setAnswer(checked),
+      (error) => isOld || setAnswer({ command: [], problem: error.message }),
+    ), CHECK_MS);
+    return () => {
+      isOld = true;
+      clearTimeout(timer);
+    };
+  }, [body, isReady]);
+  return answer;
+}
 
 /** Leave out what is not given: the server has its own defaults. */
 const given = (options) => Object.fromEntries(Object.entries(options).filter(([, value]) => value !== null));
 
 /** Return the selected controller with those of its parameters that are not the defaults. */
-function selectionWithOwn(state) {
+export function selectionWithOwn(state) {
   const { controller, edited, applied } = selectionOf(state);
   const own = Object.entries(controller ? shownParameters(controller, state.status, edited, applied) : {}).filter(([name, value]) => {
     const field = controller.parameters.find((candidate) => candidate.name === name);
     return value !== null && value !== defaultOf(field);
   });
-  return { controller, own: Object.fromEntries(own) };
+  const missing = controller ? missingOf(controller, shownParameters(controller, state.status, edited, applied)) : [];
+  return { controller, own: Object.fromEntries(own), missing };
 }
 
 export function Experiments(page) {
@@ -53,7 +83,7 @@ export function Experiments(page) {
   const [form, setForm] = useState(() => recall("experiment", {
     kind: "measure", seconds: "", values: "", parameter: "", contestants: "square swing", runs: "", subject: "", note: "",
   }));
-  const { controller, own } = selectionWithOwn(state);
+  const { controller, own, missing } = selectionWithOwn(state);
   const set = (key) => (value) => {
     const next = { ...form, [key]: value };
     remember("experiment", next);
@@ -64,6 +94,8 @@ export function Experiments(page) {
   const varied = names.includes(form.parameter) ? form.parameter : names[0];
   const seconds = form.seconds.trim() === "" ? null : numberIn(form.seconds);
 
+  const uses = ["measure", "sweep", "simulate"].includes(form.kind);
+
   const options = () => {
     switch (form.kind) {
       case "record": return { seconds, subject: form.subject || null, note: form.note || null };
@@ -72,13 +104,17 @@ export function Experiments(page) {
       default: return { controller: controller.name, parameters: own, seconds };
     }
   };
+  const isEmpty = form.kind === "sweep" ? !form.values.trim() : form.kind === "compare" && !form.contestants.trim();
+  const hasNothing = form.kind === "sweep" && controller && names.length === 0;
+  const needs = uses && missing.length > 0;
+  const isReady = Boolean(controller) && !isEmpty && !hasNothing && !needs && Boolean(state.session?.paired);
+  const { command, problem } = useCheck(state.name, form.kind, isReady ? given(options()) : {}, isReady);
+  const total = isReady && command.length ? expected(command) : null;
   const start = (event) => {
     event.preventDefault();
     startJob(page, form.kind, given(options()));
   };
   const jobs = [...state.jobs.values()].filter(({ fish }) => !fish || fish === state.name).sort((a, b) => b.id - a.id).slice(0, 8);
-  const uses = ["measure", "sweep", "simulate"].includes(form.kind);
-
   return html`
     <h2 id="experiments-title">Experiments</h2>
     <div class="tabs" role="tablist" aria-label="Kind of experiment">
@@ -101,10 +137,18 @@ export function Experiments(page) {
           ${input("Note", form.note, set("note"), { placeholder: "purpose" })}`}
         ${input("Seconds", form.seconds, set("seconds"), {
           inputmode: "decimal", class: "number", placeholder: { record: "until stopped", sweep: "30 each", simulate: "20" }[form.kind] ?? "60",
+          "aria-invalid": isReady && problem !== "", "aria-describedby": "preview",
         })}
       </div>
+      <div id="preview" aria-live="polite">
+        ${hasNothing ? html`<p class="muted">${controller.name} has no number to sweep: choose another controller.</p>`
+          : needs ? html`<p class="muted">Needed first, in the panel Controller: ${missing.map(({ name }) => name).join(", ")}.</p>`
+          : isReady && problem ? html`<p class="note">${sentence(problem)}</p>`
+            : isReady && command.length > 0 && html`<code tabindex="0" aria-label="Command line to come">${command.map(quote).join(" ")}</code>
+              ${total && html`<p class="muted">Takes about ${duration(total)}${form.kind === "simulate" ? " of virtual time" : ""}.</p>`}`}
+      </div>
       <div class="buttons">
-        <button class="primary" disabled=${!mayDrive || !controller}>${form.kind === "simulate" ? "Try on a simulated fish" : KINDS[form.kind].title}</button>
+        <button class="primary" disabled=${!mayDrive || !isReady || problem !== ""}>${form.kind === "simulate" ? "Try on a simulated fish" : KINDS[form.kind].title}</button>
         ${form.kind === "compare" && controller && html`<button type="button"
           onClick=${() => set("contestants")(`${form.contestants.trim()} ${controllerText(controller.name, own)}`.trim())}>Add ${controller.name}</button>`}
       </div>
@@ -127,7 +171,7 @@ function expected([, verb, ...words]) {
   const each = Number(valueOf("--for") ?? NaN);
   const place = words.findIndex((word) => word.startsWith("--"));
   const times = {
-    measure: () => 1, record: () => 1,
+    measure: () => 1, record: () => 1, simulate: () => 1,
     sweep: () => words.reduce((product, word) => product * (/^[\d.]+[,:]/.test(word) ? countValues(word) : 1), 1),
     compare: () => place * Number(valueOf("--runs") ?? 1),
   }[verb];
@@ -159,13 +203,14 @@ function Job({ job, state, notice, mayDrive, resume }) {
     return () => clearInterval(timer);
   }, [runs]);
   const elapsed = job.elapsed + (runs ? secondsSinceReceived(job) : 0);
-  const total = expected(job.command), ends = runs && total && elapsed > total;
-  const stop = () => call("POST", `/api/jobs/${job.id}/stop`).catch((error) => notice("error", error.message, error.remedy));
+  const total = job.kind === "simulate" ? null : expected(job.command), ends = runs && total && elapsed > total;
+  const ask = (what) => () => call("POST", `/api/jobs/${job.id}/${what}`).catch((error) => notice("error", error.message, error.remedy));
   return html`<li class=${`job ${job.state}`}>
     <div class="job-head"><b>${KINDS[job.kind]?.title ?? "Rerun"}</b><span class="pill small">${job.state}</span>
       <span class="muted">${job.state === "lost" ? "" : duration(elapsed)}${ends ? ", soon at its end" : runs && total ? ` of about ${duration(total)}` : ""}</span>
-      ${runs && html`<button type="button" disabled=${!mayDrive} onClick=${stop}>Stop</button>`}
-      ${job.resumable && html`<button type="button" disabled=${!mayDrive} onClick=${resume}>Resume</button>`}</div>
+      <span class="buttons">${runs && html`<button type="button" disabled=${!mayDrive} onClick=${ask("stop")}>Stop</button>`}
+        ${job.resumable && html`<button type="button" disabled=${!mayDrive} onClick=${resume}>Resume</button>`}
+        ${!runs && html`<button type="button" disabled=${!mayDrive} aria-label=${`Dismiss ${job.kind}`} onClick=${ask("dismiss")}>Dismiss</button>`}</span></div>
     ${runs && html`<progress key=${`${total && !ends}`} max=${total ?? undefined} value=${total && !ends ? elapsed : undefined}
       aria-label=${`Progress of ${job.kind}`}></progress>`}
     <code tabindex="0" aria-label="Command line">${job.command.map(quote).join(" ")}</code>
@@ -186,7 +231,8 @@ function Result({ job, status }) {
     return html`<p class="result">True thrust <b>${number(result.mean_thrust * 1000, 2)} mN</b> at
       ${" "}<b>${number(result.frequency, 2)} Hz</b>${Number.isFinite(result.relative_thrust)
         && html`, <b>${number(100 * result.relative_thrust, 1)} %</b> of the best square wave`}.
-      Drawn beside F<sub>x</sub>, and dashed in the thrust chart.</p>`;
+      Dashed in the live chart of the thrust.</p>
+      ${result.curve && html`<${Curve} curve=${result.curve} title="Virtual force" />`}`;
   }
   if (Number.isFinite(result.thrust)) {
     return html`<p class="result">Thrust <b>${thrust(result.thrust, halfWidthOf(result))}</b>${Number.isFinite(result.frequency)
@@ -205,91 +251,4 @@ function Result({ job, status }) {
     ${result.map((row) => html`<tr><td>${row.contestant ?? controllerText(row.controller, row.parameters)}</td>
       <td class="right">${thrust(row.thrust, halfWidthOf(row))}</td></tr>`)}
   </tbody></table>`;
-}
-
-const MAX_RUNS = 40;
-/** Kinds of experiments that the server resumes. */
-const RESUMABLE = ["measure", "sweep", "compare"];
-const shortDate = new Intl.DateTimeFormat([], { month: "short", day: "numeric", hour: "2-digit", minute: "2-digit", hourCycle: "h23" });
-
-export function Runs(page) {
-  const { state } = page;
-  const [runs, setRuns] = useState(null);
-  const [failure, setFailure] = useState(null);
-  const [open, setOpen] = useState(null);
-  const finished = [...state.jobs.values()].filter(({ state: at }) => at !== "running").length;
-  const load = () => call("GET", "/api/runs").then((found) => {
-    setRuns(found);
-    setFailure(null);
-  }).catch(setFailure);
-  useEffect(() => {
-    if (state.session?.paired) load();
-  }, [finished, state.session?.paired]);
-  const begin = (run) => run.began ?? run.about?.started ?? "";
-  const order = (run) => Number(run.number ?? run.about?.number ?? 0);
-  const list = (runs ?? []).slice().sort((a, b) => order(b) - order(a)).slice(0, MAX_RUNS);
-  return html`
-    <div class="head-row"><h2 id="runs-title">Runs</h2><button type="button" onClick=${load}>Refresh</button></div>
-    ${failure && html`<p class="note">The runs cannot be listed. ${sentence(failure.message)} ${sentence(failure.remedy)}</p>`}
-    ${runs === null ? !failure && html`<p class="muted">Loading …</p>` : list.length === 0
-      ? html`<p class="muted">None yet. Record, measure or sweep, and it is listed here.</p>`
-      : html`<div class="scroll" tabindex="0" role="region" aria-label="Table of runs"><table>
-        <thead><tr><th>name</th><th>what</th><th>began</th><th class="right">length</th><th class="right">thrust</th>
-          <th class="right">lost ticks</th><th><span class="unseen">what to do</span></th></tr></thead>
-        <tbody>${list.map((run) => {
-          const [factor, unit] = forceUnit(run);
-          const half = halfWidthOf(run);
-          const [middle, error] = run.thrust == null ? ["", ""] : interval(run.thrust * factor, half == null ? NaN : half * factor);
-          return html`<tr key=${run.name} class=${run.kind === "recording" && run.problem ? "damaged" : ""}>
-            <td>${run.name}
-              ${["running", "recording", "unfinished"].includes(run.state) && html` <span class="pill small">${run.state}</span>`}
-              ${run.problem && html`<br /><small>${run.problem}</small>`}</td><td>${run.kind === "recording" ? Object.keys(run.swim_ticks ?? {}).join(", ") || "at rest" : run.kind}</td><td>${begin(run) && shortDate.format(new Date(begin(run)))}</td>
-            <td class="right">${run.duration !== undefined ? duration(run.duration) : run.kind === "sweep" && run.rows ? `${run.rows} points` : ""}</td>
-            <td class="right">${middle} ${error} ${run.thrust == null ? "" : unit}</td>
-            <td class="right">${run.lost_ticks ?? ""}</td>
-            <td class="actions">
-              <button type="button" aria-expanded=${open === run.name} aria-label=${`${open === run.name ? "Close" : "Open"} ${run.name}`}
-                onClick=${() => setOpen(open === run.name ? null : run.name)}>${open === run.name ? "Close" : "Open"}</button>
-            </td></tr>
-            ${open === run.name && html`<tr class="plot-row"><td colspan="7"><${Run} key=${run.name} run=${run} page=${page} /></td></tr>`}`;
-        })}</tbody></table></div>`}`;
-}
-
-/** What is known of a run, what can be done with it, and its picture. */
-function Run({ run, page }) {
-  const { state } = page;
-  const { controller, own } = selectionWithOwn(state);
-  const mayDrive = state.session?.scope === "drive";
-  const { subject, note, operator } = run.about ?? {};
-  const about = [run.summary, subject, note, operator && `by ${operator}`].filter(Boolean).join("; ");
-  const rerun = (options) => () => startJob(page, "rerun", { run: run.name, ...options });
-  const resumable = run.state === "unfinished" && run.on === "live" && RESUMABLE.includes(run.kind);
-  return html`
-    ${about && html`<p>${about}</p>`}
-    ${run.command?.length > 0 && html`<p><code>${["fishctl", run.kind, ...run.command].join(" ")}</code></p>`}
-    <p class="muted">${run.path}</p>
-    ${run.kind === "recording" && html`<div class="buttons">
-      <button type="button" disabled=${!mayDrive} onClick=${rerun({})}>Rerun as recorded</button>
-      ${controller && html`<button type="button" disabled=${!mayDrive} onClick=${rerun({ controller: controller.name, parameters: own })}>
-        Rerun with ${controllerText(controller.name, own)}</button>`}
-      <span class="muted">Runs a controller again on the recorded forces, and compares its commands. The fish rests.</span></div>`}
-    ${resumable && html`<div class="buttons"><button type="button" class="primary" disabled=${!mayDrive}
-      onClick=${() => startJob(page, "resume", { run: run.name })}>Resume</button>
-      <span class="muted">It ended before it was complete; nothing is measured again.</span></div>`}
-    ${(run.kind === "recording" || run.state !== "unfinished") && html`<${Plot} name=${run.name} />`}`;
-}
-
-function Plot({ name }) {
-  const [picture, setPicture] = useState(null);
-  const [failure, setFailure] = useState("");
-  useEffect(() => {
-    let address = null;
-    fetchPicture(`/api/runs/${encodeURIComponent(name)}/plot.png`).then((blob) => {
-      address = URL.createObjectURL(blob);
-      setPicture(address);
-    }, (error) => setFailure(error.message));
-    return () => address && URL.revokeObjectURL(address);
-  }, []);
-  if (failure) return html`<p class="note">${sentence(failure)}</p>`;
-  return picture ? html`<img alt=${`Plot of ${name}`} src=${picture} />` : html`<p class="muted">It is being drawn …</p>`;
 }

@@ -281,8 +281,10 @@ def test_a_training_on_a_robot_reads_the_configuration_of_fishd_once(
     assert ("plant.omega0 is 11.0 here, 12.5 there" in result.stderr) is bool(changes)
 
 
-def test_a_training_is_drawn(tmp_path: Path) -> None:
+def test_a_training_is_drawn_at_its_end_and_later(tmp_path: Path) -> None:
     picture = tmp_path / "training.png"
     words = ("--on", "simulation", "--steps", "64", "--folder", str(tmp_path / "run"))
     assert fishctl("learn", "ppo", *words, "--plot", str(picture)).returncode == 0
     assert picture.read_bytes().startswith(b"\x89PNG")
+    assert fishctl("plot", str(tmp_path / "run")).returncode == 0
+    assert (tmp_path / "run" / "run.png").read_bytes() == picture.read_bytes()

@@ -6,7 +6,14 @@ from pathlib import Path
 import pytest
 from rigs.processes import Daemon, running
 from rigs.virtual_pi_process import Pi, virtual_pi
-from rigs.window_process import WindowProcess, run_apart, running_window, wait_until_live
+from rigs.window_process import (
+    Browser,
+    WindowProcess,
+    open_page,
+    run_apart,
+    running_window,
+    wait_until_live,
+)
 
 
 @pytest.fixture(scope="module")
@@ -22,6 +29,20 @@ def shared_window(
 @pytest.fixture
 def window(shared_window: WindowProcess, daemon: Daemon) -> WindowProcess:
     """Return the window of a module, whose fish is at rest."""
+    return shared_window
+
+
+@pytest.fixture
+def free_window(shared_window: WindowProcess, shared_daemon: Daemon) -> WindowProcess:
+    """Return the window of a module, which no page drives any more, and whose fish is at rest."""
+
+    async def release() -> None:
+        async with Browser(shared_window.url) as browser, open_page(browser) as page:
+            await page.drive()
+            await page.post("release")
+
+    run_apart(release())
+    shared_daemon.at_rest()
     return shared_window
 
 

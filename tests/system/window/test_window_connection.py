@@ -8,6 +8,8 @@ import pytest
 from rigs.processes import Daemon, running
 from rigs.window_process import Browser, WindowProcess, open_page, running_window
 
+from fishd.window.fish_link import FishLink
+
 NO_ANSWER_ONCE = """
 from fishd.client import AsyncFish, NoDaemon
 list_controllers = AsyncFish.controllers
@@ -35,6 +37,20 @@ async def test_a_fishd_that_hangs_is_stale_then_lost_then_live(
             os.kill(own_daemon.pid, signal.SIGCONT)
         await page.until("connection", lambda c: c["state"] == "live")
         await page.until("ticks")
+
+
+async def test_a_status_that_another_one_has_overtaken_is_not_taken_for_a_restart(
+    daemon: Daemon,
+) -> None:
+    kinds: list[str] = []
+    link = FishLink("fish", daemon.endpoint, lambda kind, _: kinds.append(kind))
+    first, second = daemon.status(), daemon.status()
+    assert first.uptime < second.uptime
+    for status in (second, first):
+        await link._take_status(status)
+    await link.close()
+    assert link.status == second
+    assert kinds == ["hello", "status"]
 
 
 async def test_a_fishd_that_is_killed_is_lost_and_its_successor_is_announced(

@@ -31,7 +31,9 @@ CHANGES = [
     ("/api/fish/fish/release", {}),
     ("/api/fish/fish/request", {"op": "set-controller", "args": {"name": "square"}}),
     ("/api/jobs", {"fish": "fish", "kind": "record"}),
+    ("/api/jobs/check", {"fish": "fish", "kind": "record"}),
     ("/api/jobs/1/stop", {}),
+    ("/api/jobs/1/dismiss", {}),
 ]
 
 

@@ -153,11 +153,43 @@ async def test_neither_words_of_a_command_line_nor_impossible_times_come_from_a_
         assert await page.refusal("/api/jobs", body) == (400, code)
 
 
-async def test_a_job_that_fails_says_why(window: WindowProcess) -> None:
+async def test_a_job_that_fails_says_why_and_is_dismissed(window: WindowProcess) -> None:
     async with Browser(window.url) as browser, open_page(browser) as page:
         ended = await end_of(page, await start(page, "rerun", run="none"))
         assert (ended["state"], ended["exit"]) == ("failed", 1)
         assert "none" in ended["lines"][-1]
+        await page.post(f"/api/jobs/{ended['id']}/dismiss")
+        await page.until("job", lambda job: job["state"] == "dismissed")
+        assert ended["id"] not in [job["id"] for job in await browser.get("/api/jobs")]
+        assert await page.refusal(f"/api/jobs/{ended['id']}/dismiss") == (409, "job")
+
+
+async def test_a_job_that_runs_is_not_dismissed(window: WindowProcess) -> None:
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        job = await start(page, "record", name="kept")
+        assert await page.refusal(f"/api/jobs/{job['id']}/dismiss") == (409, "job")
+        await page.post(f"/api/jobs/{job['id']}/stop")
+        await end_of(page, job)
+
+
+async def test_a_job_is_checked_without_being_started(window: WindowProcess) -> None:
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        before = await browser.get("/api/jobs")
+        body = {"fish": "fish", "kind": "measure", "options": {"controller": "square"}}
+        words = ["fishctl", "measure", "square", "--for", "60"]
+        checked = await page.post("/api/jobs/check", body)
+        assert checked == {"command": words, "problem": ""}
+        body["options"] = {"controller": "square", "seconds": 20}
+        refused = await page.post("/api/jobs/check", body)
+        assert refused["command"] == []
+        assert "20.25 to 3600 s are needed" in refused["problem"]
+        body |= {"kind": "resume", "options": {"run": "none"}}
+        assert (await page.post("/api/jobs/check", body))["command"] == ["fishctl", "resume"]
+        assert await browser.get("/api/jobs") == before
+
+
+async def test_no_other_job_is_stopped_by_a_wrong_number(window: WindowProcess) -> None:
+    async with Browser(window.url) as browser, open_page(browser) as page:
         assert await page.refusal("/api/jobs/99/stop") == (409, "job")
 
 

@@ -5,18 +5,16 @@ import json
 import re
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import pytest
 from playwright.sync_api import APIResponse, Page, Route, expect
 from rigs.browser import needs_browser, open_page, shared_browser
-from rigs.processes import PATIENCE, Daemon, running, wait_until
+from rigs.live_page import go, live_page, swim
+from rigs.processes import Daemon, running, wait_until
 from rigs.virtual_pi_process import Pi
-from rigs.window_process import NETWORK_HOST, Browser, WindowProcess, run_apart
-from rigs.window_process import open_page as open_socket
+from rigs.window_process import NETWORK_HOST, WindowProcess
 
 pytestmark = needs_browser
 
@@ -24,7 +22,6 @@ AXE = resources.files("axe_playwright_python").joinpath("axe.min.js")
 """The program that looks for barriers."""
 MAX_ASSETS_BYTES = 120_000
 RESOLVED = f"--host-resolver-rules=MAP {NETWORK_HOST} 127.0.0.1"
-expect.set_options(timeout=PATIENCE * 1e3)
 
 # Runs in the page: `app` is its own module, with the state that it shows.
 APP = "const app = await import('/app.js');"
@@ -82,33 +79,9 @@ def browser() -> Iterator[None]:
 
 
 @pytest.fixture
-def window(shared_window: WindowProcess, shared_daemon: Daemon) -> WindowProcess:
+def window(free_window: WindowProcess) -> WindowProcess:
     """Return the window of the module, which no page drives, and whose fish is at rest."""
-
-    async def release() -> None:
-        async with Browser(shared_window.url) as browser, open_socket(browser) as page:
-            await page.drive()
-            await page.post("release")
-
-    run_apart(release())
-    shared_daemon.at_rest()
-    return shared_window
-
-
-@contextmanager
-def live_page(url: str, **settings: Any) -> Iterator[tuple[Page, list[str]]]:
-    """Open the page, and wait until it shows ticks."""
-    with open_page(f"{url}/", **settings) as (page, complaints):
-        expect(page.locator("#connection")).to_contain_text("live")
-        yield page, complaints
-
-
-def swim(page: Page, controller: str = "swing") -> None:
-    page.select_option("#controller", controller)
-    with page.expect_response("**/request", timeout=PATIENCE * 1e3) as response:
-        page.click("#start")
-    assert response.value.ok
-    expect(page.locator("#mode")).to_have_text("running")
+    return free_window
 
 
 def test_a_chart_moves_and_nothing_leaves_this_machine(window: WindowProcess) -> None:
@@ -161,26 +134,6 @@ def test_stop_lets_the_fish_rest_and_keeps_the_parameters_for_the_next_start(
         page.click("#start")
         wait_until(lambda: daemon.status().parameters.get("frequency") == 1.5)
         assert complaints == []
-
-
-def test_every_controller_that_is_listed_can_be_started(window: WindowProcess) -> None:
-    needed = {"target": "0.01", "policy": "default-fish"}
-    with live_page(window.url) as (page, _):
-        listed = page.locator("#controller option").all_inner_texts()
-        assert {"hold", "square", "swing", "thrust", "ppo", "remote"} <= set(listed)
-        for name in listed:
-            page.select_option("#controller", name)
-            expect(page.locator("#start")).to_contain_text(name)
-            for parameter, value in needed.items():
-                field = page.locator(f"#parameter-{parameter}")
-                if field.count() and not field.input_value():
-                    expect(page.locator("#start")).to_be_disabled()
-                    field.fill(value)
-                    field.blur()
-            with page.expect_response("**/request", timeout=PATIENCE * 1e3) as response:
-                page.click("#start")
-            assert response.value.ok, f"{name}: {response.value.text()}"
-            expect(page.locator("#start")).to_have_text(f"Restart {name}")
 
 
 def test_the_outcome_of_an_emergency_stop_is_in_sight_of_a_page_that_is_scrolled(
@@ -329,6 +282,7 @@ def test_a_page_works_in_a_browser_that_keeps_nothing(new_window: WindowProcess)
         page.reload()
         expect(page.locator("#connection")).to_contain_text("live")
         swim(page)
+        go(page, "experiments")
         page.click("#tab-record")
         page.fill("#experiment label:has-text('Seconds') input", "0,5")
         page.click("#experiment button.primary")
@@ -368,13 +322,14 @@ def test_a_reload_restores_what_the_fish_does_and_the_first_tab_leads_to_the_eme
         expect(page.locator("#parameter-C")).to_have_value("0.5")
         expect(page.locator("#driver")).to_have_text("you drive")
         expect(page.locator("#seconds")).to_have_value("60")
-        expect(page.locator("#events")).to_contain_text("swing takes over")
         columns = f"(async () => {{ {APP} return [...app.charts.ring.columns.get('seq')] }})()"
         assert seq in page.evaluate(columns)
         page.keyboard.press("Tab")
         assert page.evaluate("document.activeElement.id") == "estop"
         page.keyboard.press("Enter")
         expect(page.locator("#estop-ms")).to_be_visible()
+        go(page, "fish")
+        expect(page.locator("#events")).to_contain_text("swing takes over")
         assert complaints == []
 
 
@@ -397,6 +352,7 @@ def test_a_device_of_the_network_pairs_with_a_link_that_leaves_its_address(
     with open_page(url) as (page, complaints):
         expect(page.locator(".pairing")).to_contain_text("not paired")
         page.goto(link)
+        name_device(page, "tablet 1")
         expect(page.locator("#connection")).to_contain_text("live")
         assert page.url == url
         assert page.locator("#start").is_disabled()
@@ -404,11 +360,20 @@ def test_a_device_of_the_network_pairs_with_a_link_that_leaves_its_address(
         wait_until(lambda: daemon.status().mode == "estop")
         expect(page.locator("#estop-ms")).to_contain_text("ms")
         assert page.locator("#clear-fault").is_disabled()
+        go(page, "fish")
+        expect(page.locator("#events")).to_contain_text("Paired as tablet 1")
         assert complaints == []
+
+
+def name_device(page: Page, name: str) -> None:
+    """Give the name for which a page that was opened by a link asks."""
+    page.get_by_label("Name of this device").fill(name)
+    page.get_by_role("button", name="Pair").click()
 
 
 def test_a_device_that_is_revoked_says_so(new_window: WindowProcess) -> None:
     with open_page(new_window.invite()) as (page, _):
+        name_device(page, "tablet")
         expect(page.locator("#connection")).to_contain_text("live")
         (device,) = json.loads(new_window.ask("devices", "--json"))
         new_window.ask("revoke", device["id"])
@@ -416,14 +381,44 @@ def test_a_device_that_is_revoked_says_so(new_window: WindowProcess) -> None:
         expect(page.locator(".pairing")).to_be_visible()
 
 
-def test_a_run_in_simulation_is_drawn_beside_the_live_force(new_window: WindowProcess) -> None:
+def test_a_run_in_simulation_is_drawn_over_its_own_time_and_dismissed(
+    new_window: WindowProcess,
+) -> None:
     with live_page(new_window.url) as (page, complaints):
+        go(page, "experiments")
         page.click("#tab-simulate")
+        expect(page.locator("#preview")).to_have_text(
+            re.compile("fishctl simulate swing --for 20.*20.s of virtual time")
+        )
         page.click("#experiment .primary")
         expect(page.locator(".job.done")).to_contain_text("True thrust")
         expect(page.locator(".job code")).to_contain_text("fishctl simulate swing")
-        expect(page.locator("figure", has_text="virtual F")).to_be_visible()
+        expect(page.locator("figure.curve", has_text="Virtual force")).to_be_visible()
+        drawn = f"(async () => {{ {APP} return app.charts.virtual }})()"
+        wait_until(lambda: page.evaluate(drawn) > 0.02)
+        page.get_by_role("button", name="Dismiss simulate").click()
+        expect(page.locator(".job")).to_have_count(0)
+        wait_until(lambda: page.evaluate(drawn) is None)
         assert complaints == []
+
+
+def test_a_form_says_at_once_what_its_job_would_refuse(new_window: WindowProcess) -> None:
+    with live_page(new_window.url) as (page, _):
+        go(page, "experiments")
+        start, seconds = page.locator("#experiment .primary"), page.get_by_label("Seconds")
+        seconds.fill("20")
+        expect(page.locator("#preview")).to_contain_text("20.25 to 3600 s are needed")
+        expect(start).to_be_disabled()
+        seconds.fill("21")
+        expect(page.locator("#preview")).to_contain_text("fishctl measure swing --for 21")
+        expect(start).to_be_enabled()
+        page.select_option("#controller", "thrust")
+        expect(page.locator("#preview")).to_contain_text("Needed first")
+        expect(start).to_be_disabled()
+        page.select_option("#controller", "ppo")
+        page.click("#tab-sweep")
+        expect(page.locator("#preview")).to_contain_text("ppo has no number to sweep")
+        expect(start).to_be_disabled()
 
 
 def test_a_stored_run_is_opened_and_another_controller_is_run_on_it(
@@ -431,16 +426,19 @@ def test_a_stored_run_is_opened_and_another_controller_is_run_on_it(
 ) -> None:
     with live_page(new_window.url) as (page, complaints):
         swim(page)
+        go(page, "experiments")
         page.click("#tab-record")
         page.get_by_label("Seconds").fill("1")
         page.get_by_label("Note").fill("a; $(b) 'c'")
         page.click("#experiment .primary")
         expect(page.locator(".job.done")).to_be_visible()
         page.select_option("#controller", "sine")
+        go(page, "runs")
         page.locator("#runs").get_by_role("button", name="Open").click()
         expect(page.locator("#runs")).to_contain_text("a; $(b) 'c'")
         expect(page.locator("#runs img")).to_be_visible()
         page.get_by_role("button", name="Rerun with sine").click()
+        go(page, "experiments")
         expect(page.locator(".job code").first).to_contain_text(" sine")
         expect(page.locator(".job.done")).to_have_count(2)
         expect(page.locator(".job").first).to_contain_text("sine in place of swing")
@@ -517,43 +515,55 @@ def test_the_memory_of_the_page_is_the_same_after_a_day_of_ticks(window: WindowP
 def test_the_keyboard_reaches_everything_and_the_focus_is_visible(window: WindowProcess) -> None:
     with live_page(window.url) as (page, _):
         swim(page)
-        expect(page.locator("#runs")).to_contain_text("None yet")
-        reachable = page.evaluate("""() => {
-            const kinds = "button, input, select, a[href], [tabindex='0']";
-            const isReachable = (node) => !node.disabled && node.checkVisibility();
-            globalThis.wanted = [...document.querySelectorAll(kinds)].filter(isReachable);
-            return wanted.length;
-        }""")
+        complete = {"experiments": "#preview code", "runs": "#runs .complete", "fish": "#events ol"}
+        for place in ("live", *complete):
+            go(page, place)
+            expect(page.locator(complete.get(place, "#mode"))).to_be_visible()
+            walk(page)
+
+
+def walk(page: Page) -> None:
+    """Reach everything that is shown with the Tab key, in reading order, the E-stop first."""
+    reachable = page.evaluate("""() => {
+        const kinds = "button, input, select, a[href], [tabindex='0']";
+        const isReachable = (node) => !node.disabled && node.checkVisibility();
+        globalThis.wanted = [...document.querySelectorAll(kinds)].filter(isReachable);
+        return wanted.length;
+    }""")
+    page.keyboard.press("Tab")
+    while page.evaluate("document.activeElement.id") != "estop":
+        page.keyboard.press("Tab")  # begins where the mouse was last
+    focused = []
+    for _ in range(reachable):
+        focused.append(
+            page.evaluate("""() => {
+                const { outlineStyle, outlineWidth } = getComputedStyle(document.activeElement);
+                if (outlineStyle === "none" || parseFloat(outlineWidth) < 2)
+                    throw new Error(`no focus is seen: ${document.activeElement.id}`);
+                return wanted.indexOf(document.activeElement);
+            }""")
+        )
         page.keyboard.press("Tab")
-        while page.evaluate("document.activeElement.id") != "estop":
-            page.keyboard.press("Tab")  # begins where the mouse was last
-        focused = []
-        for _ in range(reachable):
-            focused.append(
-                page.evaluate("""() => {
-                    const { outlineStyle, outlineWidth } = getComputedStyle(document.activeElement);
-                    if (outlineStyle === "none" || parseFloat(outlineWidth) < 2)
-                        throw new Error(`no focus is seen: ${document.activeElement.id}`);
-                    return wanted.indexOf(document.activeElement);
-                }""")
-            )
-            page.keyboard.press("Tab")
-        assert focused == list(range(reachable))  # in reading order, and the E-stop first
+    assert focused == list(range(reachable))  # in reading order, and the E-stop first
 
 
 def test_nothing_is_wider_than_the_screen_and_the_emergency_stop_keeps_its_place(
     window: WindowProcess,
 ) -> None:
     with live_page(window.url) as (page, _):
-        for width in (1360, 800, 390):
+        for width in (1280, 800, 390):
             page.set_viewport_size({"width": width, "height": 844})
             box = page.locator("#estop").bounding_box()
             assert box
             assert box["x"] + box["width"] > width - 20
             swim(page)
-            page.evaluate("scrollTo(0, 600)")
-            assert page.locator("#estop").bounding_box() == box
-            assert page.evaluate("document.documentElement.scrollWidth") == width
+            for place in ("experiments", "runs", "fish", "live"):
+                go(page, place)
+                page.evaluate("scrollTo(0, 600)")
+                assert page.locator("#estop").bounding_box() == box
+                assert page.evaluate("document.documentElement.scrollWidth") == width
+                for always in ("#mode", "#thrust"):
+                    expect(page.locator(always)).to_be_in_viewport(ratio=1)
             page.click("#stop")
             expect(page.locator("#mode")).to_have_text("idle")
 
@@ -562,19 +572,26 @@ def test_no_barrier_is_serious(window: WindowProcess) -> None:
     with live_page(window.url, bypass_csp=True) as (page, _):
         page.evaluate(AXE.read_text(encoding="utf-8"))
         swim(page)
-        for state in ("live", "estop"):
-            if state == "estop":
-                page.click("#estop")
-                expect(page.locator("#latched")).to_be_visible()
-            for scheme in ("light", "dark"):
-                page.emulate_media(color_scheme=scheme)
-                violations = page.evaluate(FIND_BARRIERS)
-                serious = [
-                    (violation["id"], [node["html"] for node in violation["nodes"]])
-                    for violation in violations
-                    if violation["impact"] in ("serious", "critical")
-                ]
-                assert serious == [], (state, scheme)
+        for width in (1280, 800, 390):
+            page.set_viewport_size({"width": width, "height": 844})
+            for place in ("experiments", "runs", "fish", "live"):
+                go(page, place)
+                refuse_barriers(page)
+        page.click("#estop")
+        expect(page.locator("#latched")).to_be_visible()
+        refuse_barriers(page)
+
+
+def refuse_barriers(page: Page) -> None:
+    """Fail if the page has a serious barrier in light or dark colours."""
+    for scheme in ("light", "dark"):
+        page.emulate_media(color_scheme=scheme)
+        serious = [
+            (violation["id"], [node["html"] for node in violation["nodes"]])
+            for violation in page.evaluate(FIND_BARRIERS)
+            if violation["impact"] in ("serious", "critical")
+        ]
+        assert serious == [], (page.url, page.viewport_size, scheme)
 
 
 def test_the_files_of_the_page_are_small() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from rigs.processes import fishctl
 from rigs.window_process import Browser, WindowProcess
 
 from fishd.window.pictures import MAX_PICTURE_BYTES
@@ -52,7 +53,7 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda path: write_sparse(path, MAX_PICTURE_BYTES + 1),
         "'measure-1/measure.png' is longer than 20 MB",
     ),
-    "none": (lambda path: None, "'measure-1' has no picture: one is drawn at the end"),
+    "none": (lambda path: None, "no recording 'measure-1', neither a file nor a name in"),
     "file": (
         lambda path: (path.parent.rmdir(), path.parent.write_bytes(SECRET)),
         "'measure-1' is a file; a folder is needed",
@@ -88,6 +89,27 @@ async def test_a_page_gets_nothing_but_a_regular_picture_in_the_folder_of_a_run(
         assert response.status == 409
         assert problem.replace("measure-1", picture.parent.name) in body.decode()
         assert SECRET not in body
+
+
+async def test_a_picture_is_drawn_when_asked_for_and_again_if_the_run_has_changed(
+    window: WindowProcess,
+) -> None:
+    folder = window.state.parent / "runs" / "drawn-later"
+    words = ("measure", "swing", "--on", "simulation", "--for", "21", "--folder", str(folder))
+    assert fishctl(*words).returncode == 0
+    async with Browser(window.url) as browser:
+
+        async def picture() -> bytes:
+            async with browser.session.get("/api/runs/drawn-later/plot.png") as response:
+                assert (response.status, response.content_type) == (200, "image/png")
+                return await response.read()
+
+        measured = await picture()
+        assert measured.startswith(b"\x89PNG")
+        assert await picture() == measured
+        (folder / "result.json").unlink()
+        assert await picture() != measured
+    assert not list(folder.glob("*.png"))
 
 
 async def test_a_picture_of_the_largest_size_is_served_whole_to_each_who_asks_at_once(

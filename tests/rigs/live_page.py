@@ -1,0 +1,40 @@
+"""The page of a window in a true browser, once it shows ticks."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from playwright.sync_api import Page, expect
+
+from rigs.browser import open_page
+from rigs.processes import PATIENCE
+
+expect.set_options(timeout=PATIENCE * 1e3)
+
+
+@contextmanager
+def live_page(url: str, **settings: Any) -> Iterator[tuple[Page, list[str]]]:
+    """Open the page, and wait until it shows ticks; see `open_page`."""
+    with open_page(f"{url}/", **settings) as (page, complaints):
+        expect(page.locator("#connection")).to_contain_text("live")
+        yield page, complaints
+
+
+def go(page: Page, place: str) -> None:
+    """Show a part of the page: `live`, `experiments`, `runs` or `fish`."""
+    page.click(f"#places a[href='#{place}']")
+    expect(page.locator(f"main[data-place={place}]")).to_be_visible()
+
+
+def swim(page: Page, controller: str = "swing") -> None:
+    """Start a controller, and wait until the fish swims."""
+    page.select_option("#controller", controller)
+    start(page)
+    expect(page.locator("#mode")).to_have_text("running")
+
+
+def start(page: Page) -> None:
+    """Start the controller that is chosen; fishd must accept it."""
+    with page.expect_response("**/request", timeout=PATIENCE * 1e3) as response:
+        page.click("#start")
+    assert response.value.ok, response.value.text()
