@@ -1,0 +1,1 @@
+"""Measurement of the fin angle in pictures of the tail."""

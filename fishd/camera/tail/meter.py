@@ -1,0 +1,342 @@
+"""Fin angle from each picture of a tail that was learned.
+
+The angle is the direction of the straight line through the fin's middles. It is given only if the
+rest of the picture agrees: the midline has the learned shape for that angle, nothing else covers
+the ground, and the fin did not jump.
+"""
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from fishd.camera.tail.ground import Floats, Ground, shrink
+from fishd.camera.tail.learned import CannotUse, Learned
+from fishd.camera.tail.learner import cut_off_side
+from fishd.camera.tail.profile import (
+    SATURATED,
+    STATIONS,
+    Array,
+    Line,
+    Pose,
+    Trace,
+    Tracer,
+    fit_line,
+)
+from fishd.camera.tail.shape import Fit, Shape
+from fishd.core.camera_frames import Pixels
+from fishd.core.tail_reading import TailReading
+
+_MIN_LENGTH = 0.55
+"""Shortest part of the tail that must be seen."""
+_MAX_FOREIGN = 0.006
+"""Largest fraction of the picture that something else may cover."""
+_FOREIGN_LEVEL = 0.5
+"""Change of a pixel that something else causes, relative to that by the tail."""
+_MIN_FIN_SEEN = 0.6
+"""Smallest fraction of the fin's stations that must be seen."""
+_MAX_SHAPE_ERROR = 0.004
+"""Permitted distance of a midline from the learned shape, relative to the picture's width."""
+_MIN_DIFFERENCE_RAD, _MAX_DIFFERENCE_RAD = 0.03, 0.045
+"""Range of the permitted difference of the fin's direction from that by the learned shape [rad]."""
+_MAX_TURN_RAD = 0.03
+"""Permitted turn of a midline about its root in one picture [rad]."""
+_USUAL = 3.0
+"""Permitted error, relative to that of 95 % of the learned pictures, if that is larger."""
+_KNOCK_S = 0.8
+"""Time over which the turn of the midlines is averaged [s]."""
+_KNOCK_RAD = 0.012
+"""Mean turn above which the zero has moved [rad]."""
+_MEAN_TURN = 0.6
+"""The same, relative to the turn that 95 % of single learned pictures stay below."""
+_MIN_KNOCK_READINGS = 5
+_MIN_SIDE_READINGS = 6
+"""Number of readings from which a side of the swing counts for itself."""
+_SCENE_S = 0.5
+"""Time for which something else is seen before the scene is compared with the background [s]."""
+_MAX_UNEXPLAINED = 0.15
+"""Largest part of what covers the ground that a turn of the background leaves unexplained."""
+_JUMP_RAD = 0.06
+"""Permitted change between two pictures, in addition to that at the highest speed [rad]."""
+_JUMP_RATE = 1.5
+"""Permitted speed, relative to the highest one during learning."""
+_JUMP_S = 0.2
+"""Longest time between two pictures whose change is judged [s]."""
+_SPAN = 1.25
+"""Range of angles relative to that learned."""
+_MIN_REPEATED_RATE = 0.3
+"""Speed of the fin above which two equal pictures are one that the camera repeats [rad/s]."""
+MIDLINE_POINTS = 16
+"""Number of points of a midline."""
+
+
+class _Seen(NamedTuple):
+    """Fin and midline in one picture."""
+
+    trace: Trace
+    line: Line
+    fit: Fit
+    alpha: float
+
+
+class TailMeter:
+    """Meter of the fin angle."""
+
+    def __init__(self, learned: Learned) -> None:
+        self.learned = learned
+        self._ground = Ground(
+            learned.background_picture(), learned.size, learned.tail_level, learned.swept_mask()
+        )
+        self._half = np.array(learned.half_thickness)
+        self._pose = Pose(learned.root, learned.direction)
+        self._tracer = Tracer(
+            self._ground, self._pose, float(self._half.max()), learned.length, self._half
+        )
+        self._shape = Shape(np.array(learned.shape))
+        first, last = learned.fin
+        self._fin = slice(round((1.0 - last) * STATIONS), round((1.0 - first) * STATIONS))
+        self._fin_length = learned.length * (last - first)
+        low, high = learned.span
+        self._span = _SPAN * low - 0.05, _SPAN * high + 0.05
+        self._is_light = learned.is_light
+        width = learned.size[0]
+        self._max_error = max(_MAX_SHAPE_ERROR * width, _USUAL * learned.shape_error)
+        self._max_difference = min(
+            max(_MIN_DIFFERENCE_RAD, _USUAL * learned.direction_error), _MAX_DIFFERENCE_RAD
+        )
+        self._max_turn = max(_MAX_TURN_RAD, _USUAL * learned.turn_error)
+        self._max_mean_turn = max(_KNOCK_RAD, _MEAN_TURN * learned.turn_error)
+        self._turns: deque[tuple[float, float, bool]] = deque()
+        """Time, turn, and whether the fin is on the positive side."""
+        self._foreign_since = math.inf
+        self._scene_moved = self._zero_moved = ""
+        self._small: Pixels | None = None
+        """Previous picture, shrunk."""
+        self._last: tuple[float, float] | None = None
+        self._rate = 0.0
+        """Speed of the fin before `_last` [rad/s]."""
+        self._spread = learned.direction_error / 2.0
+        """Recent root mean square of the difference from the learned shape [rad]."""
+
+    def read(
+        self, time: float, picture: Pixels, row_time: float = 0.0, column_time: float = 0.0
+    ) -> TailReading:
+        """Return what a whole turned picture shows.
+
+        time: middle of the exposure of the middle of the picture [s]
+        row_time: time from the exposure of the first row to that of the last one [s]
+        column_time: the same for the columns, of a picture that was turned by 90° [s]
+        """
+        zero = self.learned.zero
+        try:
+            self.learned.check_size(picture.shape[1], picture.shape[0])
+        except CannotUse as error:
+            return TailReading(time=time, zero=zero, reason=str(error))
+        small = shrink(picture)
+        is_repeated = self._small is not None and np.array_equal(small, self._small)
+        self._small = small
+        if is_repeated and abs(self._rate) > _MIN_REPEATED_RATE:
+            return TailReading(time=time, zero=zero, reason="the camera repeats a picture")
+        light = self._ground.light(small)
+        cover = self._ground.cover(small, light)
+        trace = self._tracer.trace_cover(picture, light, cover)
+        if trace is None:
+            return TailReading(time=time, zero=zero, reason="no tail where it was learned")
+        places = self._pose.to_picture(trace.points)
+        middle = places[self._fin].mean(axis=0)
+        height, width = picture.shape
+        time += row_time * (float(middle[1]) / max(height - 1, 1) - 0.5)
+        time += column_time * (float(middle[0]) / max(width - 1, 1) - 0.5)
+        tip = places[-1] + 0.5 * (places[-1] - places[-2])
+        line = np.concatenate([[self._pose.root], places, [tip]])
+        chosen = line[np.linspace(0, len(line) - 1, MIDLINE_POINTS).round().astype(int)]
+        lag = row_time * places[:, 1] / max(height - 1, 1) + column_time * places[:, 0] / max(
+            width - 1, 1
+        )
+        seen = self._look(trace, lag - lag[self._fin].mean(), time)
+        reason = self._find_fault(seen, small, cover, places, time)
+        alpha, uncertainty = None, None
+        if not reason and seen is not None:
+            alpha = seen.alpha
+            if self._last is not None and time > self._last[0]:
+                self._rate = (alpha - self._last[1]) / (time - self._last[0])
+            self._last = time, alpha
+            self._spread += 0.1 * (abs(alpha - seen.fit.alpha) - self._spread)
+            uncertainty = math.hypot(
+                2.5 * self._spread, 3.5 * seen.line.residual / self._fin_length, 5e-4
+            )
+        return TailReading(
+            time=time,
+            alpha=alpha,
+            zero=zero,
+            uncertainty=uncertainty,
+            reason=reason,
+            tip=(float(tip[0]), float(tip[1])),
+            midline=tuple((float(x), float(y)) for x, y in chosen),
+        )
+
+    def _look(self, trace: Trace, lag: Array, time: float) -> _Seen | None:
+        """Return line and shape; None where too little of the fin is seen.
+
+        lag: time from the exposure of the fin to that of each station [s]
+        """
+        weight = trace.weight if self._is_light else trace.weight * ~trace.glaring
+        fin = weight[self._fin]
+        if fin.sum() < _MIN_FIN_SEEN * len(fin):
+            return None
+        points = trace.points
+        line = fit_line(points[self._fin], fin)
+        zero = self.learned.zero
+        if lag.any() and self._last is not None and 0.0 < time - self._last[0] < _JUMP_S:
+            # Rows of a rolling shutter show the tail at different times.
+            rate = (line.angle - zero - self._last[1]) / (time - self._last[0])
+            rate += 0.5 * (rate - self._rate)  # it is that of half a picture ago
+            points = points - (rate * lag)[:, None] * self._shape.change(line.angle - zero)
+            line = fit_line(points[self._fin], fin)
+        alpha = line.angle - zero
+        return _Seen(trace, line, self._shape.fit(points, weight, alpha, self._span), alpha)
+
+    def _find_fault(
+        self, seen: _Seen | None, small: Pixels, cover: Floats, places: Array, time: float
+    ) -> str:
+        """Return why the angle is unknown; empty if it is known."""
+        place = self._find_foreign(small, cover, places)
+        moved = self._watch_zero(None if place else seen, time)
+        if seen is not None and seen.trace.length < _MIN_LENGTH * self.learned.length:
+            side = cut_off_side(self._pose.to_picture(seen.trace.path), self.learned.size)
+            return _leaves(side) if side else moved or "no tail where it was learned"
+        if side := cut_off_side(places, self.learned.size):
+            return _leaves(side)
+        if moved:
+            return moved
+        self._watch_scene(place is not None, small, time)
+        if self._scene_moved:
+            return self._scene_moved
+        if place is not None:
+            return f"something else moves near column {place[0]}, row {place[1]}"
+        if seen is None:
+            return self._find_lamp(small, places) or "too little of the fin is seen"
+        if not self._span[0] < seen.alpha < self._span[1]:
+            return (
+                f"{1e3 * seen.alpha:.0f} mrad are beyond the swing that was learned: learn again "
+                "with a larger one"
+            )
+        differs = abs(seen.alpha - seen.fit.alpha) > self._max_difference
+        if differs or seen.fit.error > self._max_error or abs(seen.fit.turn) > self._max_turn:
+            return self._find_lamp(small, places) or "the tail does not have the learned shape"
+        if self._last is not None:
+            before, angle = self._last
+            limit = _JUMP_RAD + _JUMP_RATE * self.learned.top_rate * (time - before)
+            if 0.0 < time - before < _JUMP_S and abs(seen.alpha - angle) > limit:
+                return "the fin jumped, or something else looks like it"
+        return ""
+
+    def _watch_zero(self, seen: _Seen | None, time: float) -> str:
+        """Return by how much the zero has moved, if it has."""
+        turns = self._turns
+        if turns and time < turns[-1][0]:
+            turns.clear()
+            self._zero_moved = ""
+        if (
+            seen is not None
+            and seen.trace.weight.mean() > 0.9
+            and seen.fit.error_turned
+            < max(0.5 * _MAX_SHAPE_ERROR * self.learned.size[0], self.learned.shape_error)
+        ):
+            turns.append((time, seen.fit.turn, seen.alpha > 0.0))
+        while turns and time - turns[0][0] > _KNOCK_S:
+            turns.popleft()
+        if len(turns) < _MIN_KNOCK_READINGS or turns[-1][0] - turns[0][0] < 0.7 * _KNOCK_S:
+            return self._zero_moved
+        turn = float(np.median([turn for _, turn, _ in turns]))
+        sides = [[turn for _, turn, is_side in turns if is_side is side] for side in (False, True)]
+        if min(map(len, sides)) >= _MIN_SIDE_READINGS:
+            # A shape that differs from the learned one turns each side by another angle.
+            turn = min(turn, float(np.mean([np.median(side) for side in sides])), key=abs)
+        self._zero_moved = _zero_moved(turn) if abs(turn) >= self._max_mean_turn else ""
+        return self._zero_moved
+
+    def _watch_scene(self, is_foreign: bool, small: Pixels, time: float) -> None:
+        """Compare what stands still with the background, where it has not agreed for long."""
+        if not is_foreign:
+            self._foreign_since, self._scene_moved = math.inf, ""
+            return
+        self._foreign_since = min(self._foreign_since, time)
+        if time - self._foreign_since < _SCENE_S:
+            return
+        self._foreign_since = time
+        self._scene_moved = ""
+        still = self._ground.still.astype(np.uint8)
+        try:
+            _, transform = cv2.findTransformECC(
+                self._ground.background, small.astype(np.float32), np.eye(2, 3, dtype=np.float32),
+                cv2.MOTION_EUCLIDEAN,
+                (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4), still, 3,
+            )  # fmt: skip
+        except cv2.error:  # it does not converge
+            return
+        warp, flags = np.asarray(transform), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        turned = cv2.warpAffine(
+            small, warp, small.shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE
+        )
+        before, after = (
+            self._count_foreign(np.asarray(each, np.uint8)) for each in (small, turned)
+        )
+        turn = math.atan2(float(warp[1, 0]), float(warp[0, 0]))
+        if abs(turn) > _KNOCK_RAD and after < _MAX_UNEXPLAINED * before:
+            self._scene_moved = _zero_moved(turn)
+
+    def _count_foreign(self, small: Pixels) -> int:
+        """Return how many pixels that the tail never covers differ from the background."""
+        cover = self._ground.cover(small, self._ground.light(small))
+        return int(np.count_nonzero((np.abs(cover) > _FOREIGN_LEVEL) & self._ground.still))
+
+    def _find_foreign(self, small: Pixels, cover: Floats, places: Array) -> tuple[int, int] | None:
+        """Return the column and row of something else that covers the ground."""
+        outline = self._outline(places) / self._ground.scale
+        mask = (np.abs(cover) > _FOREIGN_LEVEL) & (small < SATURATED)
+        foreign = mask.astype(np.uint8)
+        cv2.fillPoly(foreign, [np.rint(16 * outline).astype(np.int32)], 0, shift=4)
+        if np.count_nonzero(foreign) < _MAX_FOREIGN * foreign.size:
+            return None
+        rows, columns = np.nonzero(foreign)
+        scale = self._ground.scale
+        return round(float(np.median(columns)) * scale), round(float(np.median(rows)) * scale)
+
+    def _outline(self, places: Array) -> Array:
+        """Return the corners of a polygon that encloses the tail, with room for blur."""
+        tangent = np.gradient(places, axis=0)
+        tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+        reach = (1.3 * self._half + 0.025 * self.learned.size[0])[:, None]
+        normal = reach * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+        start, end = (
+            places[:1] - reach[0] * tangent[:1],
+            places[-1:] + 1.5 * reach[-1] * tangent[-1:],
+        )
+        middle = np.concatenate([start, places, end])
+        normal = np.concatenate([normal[:1], normal, normal[-1:]])
+        return np.concatenate([middle + normal, (middle - normal)[::-1]])
+
+    def _find_lamp(self, small: Pixels, places: Array) -> str:
+        """Return where a lamp is mirrored on the tail; empty if none is."""
+        if self._is_light:
+            return ""
+        lamp = (small >= SATURATED).astype(np.uint8)
+        inside = np.zeros_like(lamp)
+        outline = self._outline(places) / self._ground.scale
+        cv2.fillPoly(inside, [np.rint(16 * outline).astype(np.int32)], 1, shift=4)
+        rows, columns = np.nonzero(lamp & inside)
+        if len(rows) < 4:
+            return ""
+        x, y = (round(float(np.median(part)) * self._ground.scale) for part in (columns, rows))
+        return f"a lamp is mirrored on the tail at column {x}, row {y}"
+
+
+def _leaves(side: str) -> str:
+    return f"the tail leaves the picture at the {side}"
+
+
+def _zero_moved(turn: float) -> str:
+    return f"the zero has moved by {1e3 * abs(turn):.0f} mrad: learn again"

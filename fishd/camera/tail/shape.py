@@ -1,0 +1,90 @@
+"""Midline of a tail as a function of its fin angle, as learned."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+_ITERATIONS = 4
+
+
+class Fit(NamedTuple):
+    """Agreement of a midline with a shape."""
+
+    alpha: float
+    """Fin angle whose midline comes closest [rad]."""
+    error: float
+    """Root mean square of the distances that remain [px]."""
+    turn: float
+    """Angle by which the whole midline is turned about the root [rad]."""
+    error_turned: float
+    """Root mean square of the distances that remain after that turn [px]."""
+
+
+class Shape:
+    """Polynomials in α of the places of the stations along and across the axis."""
+
+    def __init__(self, coefficients: Array) -> None:
+        """coefficients: of the powers of α from 0, shape (order, 2, stations) [px]"""
+        self.coefficients = coefficients
+        self._derivative = coefficients[1:] * np.arange(1, len(coefficients))[:, None, None]
+
+    @classmethod
+    def learn(cls, alpha: Array, points: Array, weight: Array, order: int) -> "Shape":
+        """Return the polynomials that fit midlines best.
+
+        alpha: fin angles, shape (n,) [rad]
+        points: places along and across the axis, shape (n, stations, 2) [px]
+        weight: shape (n, stations)
+        """
+        powers = alpha[:, None] ** np.arange(order)
+        # A small penalty keeps the highest powers down where the span is narrow.
+        penalty = 1e-3 * np.diag([0.0, 0.0, *np.ptp(alpha) ** np.arange(2.0, order)])
+        known = weight.min(axis=1) > 0.0
+        table = np.concatenate([powers[known], penalty])
+        flat = points[known].transpose(0, 2, 1).reshape(int(known.sum()), -1)
+        rows = np.concatenate([flat, np.zeros((order, flat.shape[1]))])
+        coefficients = np.linalg.lstsq(table, rows, rcond=None)[0]
+        return cls(coefficients.reshape(order, 2, -1))
+
+    def midline(self, alpha: float) -> Array:
+        """Return places along and across the axis, shape (stations, 2) [px]."""
+        return np.asarray(
+            np.tensordot(alpha ** np.arange(len(self.coefficients)), self.coefficients, 1).T
+        )
+
+    def change(self, alpha: float) -> Array:
+        """Return the derivative of `midline` with α, shape (stations, 2) [px/rad]."""
+        powers = alpha ** np.arange(len(self._derivative))
+        return np.asarray(np.tensordot(powers, self._derivative, 1).T)
+
+    def fit(self, points: Array, weight: Array, alpha: float, span: tuple[float, float]) -> Fit:
+        """Return the agreement with a midline.
+
+        alpha: fin angle to begin with [rad]
+        span: range in which α is searched [rad]
+        """
+        alpha = min(max(alpha, span[0]), span[1])
+        distance, total = np.zeros(len(points)), max(float(weight.sum()), 1e-9)
+        for _ in range(_ITERATIONS):
+            distance, slope, _normal = self._distances(points, alpha)
+            step = float((weight * slope) @ distance) / max(float((weight * slope) @ slope), 1e-9)
+            alpha = min(max(alpha + step, span[0]), span[1])
+        distance, slope, normal = self._distances(points, alpha)
+        error = float(np.sqrt(weight @ distance**2 / total))
+        arm = self.midline(alpha) - self.coefficients[0, :, 0]
+        turning = normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]
+        table = np.stack([slope, turning, np.ones(len(points))], axis=1) * weight[:, None]
+        solution = np.linalg.lstsq(table, weight * distance, rcond=None)[0]
+        rest = weight * distance - table @ solution
+        return Fit(alpha, error, float(solution[1]), float(np.sqrt(rest @ rest / total)))
+
+    def _distances(self, points: Array, alpha: float) -> tuple[Array, Array, Array]:
+        """Return distances from the midline at α, its change with α, and its normals."""
+        line = self.midline(alpha)
+        tangent = np.gradient(line, axis=0)
+        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+        normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+        change = self.change(alpha)
+        return ((points - line) * normal).sum(axis=1), (change * normal).sum(axis=1), normal

@@ -1,0 +1,88 @@
+"""Errors of the fin angle that is measured in pictures, on films whose fin angle is known.
+
+Each film of the tests is learned from its first 5 s and measured in the next 7 s. The worst of all
+seeds is shown, and after a slash the goal.
+"""
+
+import sys
+import time
+import tracemalloc
+from argparse import Namespace
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from common.report import DOCS, JOBS, Options, Report, run_cases, table
+
+sys.path.append(str(DOCS.parent / "tests"))
+from rigs.filmed_tail import FilmedTail
+from rigs.measured_tail import ASKED, CASES, find_errors
+
+from fishd.camera.tail.learner import Learner
+from fishd.camera.tail.meter import TailMeter
+
+OPTIONS: Options = JOBS | {
+    "--seeds": {"type": int, "default": 3, "help": "number of films of each kind"}
+}
+
+
+def measure(options: Namespace) -> Report:
+    """Return the table."""
+    films = [(case, seed) for case in CASES for seed in range(options.seeds)]
+    results = dict(zip(films, run_cases(_measure_film, films, options.jobs), strict=True))
+    rows = []
+    for case, asked in ASKED.items():
+        each = np.array([results[case, seed] for seed in range(options.seeds)])
+        cells = [
+            f"{worst:.1f}" + (f"/{limit:g}" if limit is not None else "")
+            for worst, limit in zip(np.abs(each[:, :2]).max(axis=0), asked, strict=True)
+        ]
+        rows.append([case, *cells])
+    every = np.array(list(results.values()))
+    is_bent = np.array([CASES[case].lens != 0.0 for case, _ in results])
+    known, *covered = (
+        100.0 * each.min() for each in (every[:, 2], every[~is_bent, 3], every[is_bent, 3])
+    )
+    about = (
+        f"Of the pictures, at least {known:.0f} % are measured, {covered[0]:.0f} % of them within "
+        f"their ± (with a lens, {covered[1]:.0f} %). One takes {every[:, 4].max():.1f} ms, and "
+        f"learning {every[:, 5].max():.1f} s and {_find_memory() / 1e6:.0f} MB."
+    )
+    figures = {f"{case}, seed {seed}": result for (case, seed), result in results.items()}
+    return Report(
+        {"bench fin_angle": f"{table('film | rms [mrad] | α_max [%]', rows)}\n\n{about}"}, figures
+    )
+
+
+def _measure_film(case: tuple[str, int]) -> list[float]:
+    """Return the errors of a film [mrad, %], two fractions, and the cost [ms, s]."""
+    cv2.setNumThreads(1)
+    film = replace(CASES[case[0]], seed=case[1])
+    camera, learner = FilmedTail(film), Learner()
+    for shot in camera.shots(0.0, 5.0):
+        learner.add(*shot)
+    begin = time.process_time()
+    learned = learner.finish()
+    learning = time.process_time() - begin
+    meter, readings, cost = TailMeter(learned), [], 0.0
+    for shot in camera.shots(5.0, 12.0):
+        begin = time.process_time()
+        readings.append(meter.read(shot.time, shot.picture, film.read_out))
+        cost += time.process_time() - begin
+    errors = find_errors(film, readings)
+    return [
+        1e3 * errors.rms, 100.0 * errors.alpha_max, errors.known, errors.covered,
+        1e3 * cost / len(readings), learning,
+    ]  # fmt: skip
+
+
+def _find_memory() -> int:
+    """Return the largest memory of pictures and of learning from them [bytes]."""
+    tracemalloc.start()
+    learner = Learner()
+    for shot in FilmedTail(CASES["plain"]).shots(0.0, 17.0):
+        learner.add(*shot)
+    tracemalloc.reset_peak()
+    learner.finish()
+    return tracemalloc.get_traced_memory()[1]
