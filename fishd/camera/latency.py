@@ -85,7 +85,7 @@ def find_latency(frames: Sequence[Frame], forces: Sequence[Force]) -> Latency:
     """
     if not forces or forces[-1].end - forces[0].begin < MIN_SWIM_S:
         raise NoDelay(f"{MIN_SWIM_S:g} s of swimming are needed to measure a delay")
-    angle = _Angle(forces)
+    angle = ForceAngle(forces)
     inside = [
         frame
         for frame in frames
@@ -96,7 +96,7 @@ def find_latency(frames: Sequence[Frame], forces: Sequence[Force]) -> Latency:
     times = np.array([frame.time for frame in inside])
     position = find_tail_positions(np.stack([frame.pixels for frame in inside]))
     position /= position.std()
-    fit = _Fit(angle, times, position)
+    fit = Fit(angle, times, position)
     delay, log_rate = fit.best()
     agreement = 1.0 - fit.misfit(delay, log_rate)
     if agreement < _MIN_AGREEMENT:
@@ -105,7 +105,7 @@ def find_latency(frames: Sequence[Frame], forces: Sequence[Force]) -> Latency:
             "and does the camera see its whole tail?"
         )
     left_out = [
-        _Fit(angle, times[kept], position[kept]).near(delay, log_rate)[0]
+        Fit(angle, times[kept], position[kept]).near(delay, log_rate)[0]
         for kept in _all_but_one_part(len(times))
     ]
     ci95 = _STUDENT * math.sqrt((JACKKNIFE_PARTS - 1) * float(np.var(left_out)))
@@ -125,7 +125,7 @@ def _all_but_one_part(number: int) -> list[NDArray[np.bool_]]:
     return [part != left_out for left_out in range(JACKKNIFE_PARTS)]
 
 
-class _Angle:
+class ForceAngle:
     """Fin angle that follows from the forces, up to a scale and a drift."""
 
     def __init__(self, forces: Sequence[Force]) -> None:
@@ -155,10 +155,10 @@ class _Angle:
         return np.asarray(np.interp(times, self._fine, angles))
 
 
-class _Fit:
+class Fit:
     """Fit of pictures to forces, over the delay and the rate K_d/K."""
 
-    def __init__(self, angle: _Angle, times: Floats, position: Floats) -> None:
+    def __init__(self, angle: ForceAngle, times: Floats, position: Floats) -> None:
         self._angle, self._times = angle, times
         span = times[-1] - times[0]
         along = (times - times[0]) / span
@@ -167,12 +167,12 @@ class _Fit:
         seen = np.stack([position, position**3], axis=1)
         self._seen = np.linalg.qr(_residual_after(self._drift, seen))[0]
 
-    def misfit(self, delay: float, log_rate: float) -> float:
+    def misfit(self, *point: float) -> float:
         """Return the fraction of the angle's variance that the pictures do not explain."""
-        residual = self._residual(delay, log_rate)
+        residual = self.residual(*point)
         return float(residual @ residual)
 
-    def best(self) -> tuple[float, float]:
+    def best(self) -> tuple[float, ...]:
         """Return the delay [s] and the logarithm of the rate of the best fit."""
         grid = [
             (float(delay), float(log_rate))
@@ -181,19 +181,23 @@ class _Fit:
         ]
         return self.near(*min(grid, key=lambda point: self.misfit(*point)))
 
-    def near(self, delay: float, log_rate: float) -> tuple[float, float]:
-        """Return the best fit close to a point, by the Levenberg-Marquardt method."""
-        point, damping = np.array([delay, log_rate]), 1e-3
-        residual = self._residual(*point)
+    def near(self, *begin: float) -> tuple[float, ...]:
+        """Return the arguments of `residual` that fit best close to these, two or three.
+
+        The method is that of Levenberg and Marquardt.
+        """
+        point, damping = np.array(begin), 1e-3
+        probes = _PROBES[: len(point), : len(point)]
+        residual = self.residual(*point)
         for _ in range(40):
             slopes = np.stack(
-                [(self._residual(*(point + step)) - residual) / step.sum() for step in _PROBES],
+                [(self.residual(*(point + step)) - residual) / step.sum() for step in probes],
                 axis=1,
             )
             normal = slopes.T @ slopes
             damped = normal + damping * np.diag(np.diag(normal))
             move = np.linalg.lstsq(damped, -slopes.T @ residual, rcond=None)[0]
-            new_residual = self._residual(*(point + move))
+            new_residual = self.residual(*(point + move))
             if not new_residual @ new_residual < residual @ residual:
                 damping *= 10.0
                 if damping > 1e6:
@@ -202,18 +206,21 @@ class _Fit:
             point, residual, damping = point + move, new_residual, 0.1 * damping
             if abs(move[0]) < 1e-6:
                 break
-        return float(point[0]), float(point[1])
+        return tuple(point.tolist())
 
-    def _residual(self, delay: float, log_rate: float) -> Floats:
-        angle = _residual_after(
-            self._drift, self._angle.at(self._times - delay, math.exp(log_rate))
-        )
+    def residual(self, delay: float, log_rate: float, stretch: float = 0.0) -> Floats:
+        """Return what the pictures do not explain of the angle, which has the norm 1.
+
+        stretch: relative error of the pictures' clock, about the middle of their times
+        """
+        times = self._times - delay + stretch * (self._times - 0.5 * self._times[[0, -1]].sum())
+        angle = _residual_after(self._drift, self._angle.at(times, math.exp(log_rate)))
         angle /= np.linalg.norm(angle)
         return _residual_after(self._seen, angle)
 
 
-_PROBES = np.diag([1e-4, 1e-3])
-"""Steps of the delay [s] and of the logarithm of the rate for numerical derivatives."""
+_PROBES = np.diag([1e-4, 1e-3, 1e-5])
+"""Steps of the arguments of `Fit.residual` for numerical derivatives."""
 
 
 def _residual_after(basis: Floats, values: Floats) -> Floats:

@@ -1,0 +1,278 @@
+"""`fishctl camera measure VIDEO`: the fin angle of each picture of a video, in a table."""
+
+import json
+import subprocess
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas
+import pytest
+from rigs.filmed_swim import swum
+from rigs.filmed_tail import Film, FilmedTail, rest_before, sine
+from rigs.filmed_video import film_video, write_video
+from rigs.processes import fishctl, one_line
+from rigs.recordings import write
+from scipy.interpolate import CubicSpline
+
+from fishd.camera.tail_table import CannotWriteTable, TailTable
+from fishd.core.signals import Tick
+
+pytestmark = pytest.mark.slow
+BEGIN, SECONDS = 1.25, 8.0
+"""Time of the first tick in the video, and length of the video [s]."""
+MM = 80.0
+
+
+@pytest.fixture(scope="module")
+def ticks() -> list[Tick]:
+    return swum(12.0)
+
+
+@pytest.fixture(scope="module")
+def camera(ticks: list[Tick]) -> FilmedTail:
+    """A camera above the fish of the ticks, which begins before them."""
+    spline = CubicSpline([tick.time for tick in ticks], [tick.alpha for tick in ticks])
+    return FilmedTail(Film(width=400, height=240, motion=rest_before(BEGIN, spline)))
+
+
+@pytest.fixture(scope="module")
+def video(camera: FilmedTail, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return film_video(tmp_path_factory.mktemp("video") / "fish.avi", camera, 0.0, SECONDS)
+
+
+@pytest.fixture(scope="module")
+def run(ticks: list[Tick], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("run") / "run", ticks)
+
+
+Result = tuple[pandas.DataFrame, dict[str, Any], Path]
+
+
+@pytest.fixture(scope="module")
+def measured(video: Path, run: Path, tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """The table, the printed result and the folder of a measurement with all options."""
+    folder = tmp_path_factory.mktemp("measured")
+    done = measure(
+        video, folder / "fish.csv",
+        *("--with", run, "--length", MM, "--plot", folder / "fish.png", "--json"),
+        *("--learn", "--learned", folder / "fish.bin"),
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return pandas.read_csv(folder / "fish.csv"), json.loads(done.stdout), folder
+
+
+def measure(video: Path, table: Path, *more: object) -> subprocess.CompletedProcess[str]:
+    return fishctl("camera", "measure", str(video), "--to", str(table), *map(str, more))
+
+
+def test_a_table_has_the_fin_angle_of_each_picture(measured: Result, camera: FilmedTail) -> None:
+    table, result, _ = measured
+    error = table.fin_angle - camera.alpha(table.video_time.to_numpy())
+    assert len(table) == result["pictures"] == 30 * SECONDS
+    assert table.fin_angle.count() == result["known"] > 0.95 * len(table)
+    assert table.reason.count() == sum(result["unknown"].values()) == len(table) - result["known"]
+    assert error.std() < 3e-3
+    assert error.abs().max() < 0.02
+    assert (error - error.mean()).abs().quantile(0.95) < table.fin_angle_uncertainty.median()
+    assert table.video_time.diff().dropna().to_numpy() == pytest.approx(1 / 30, abs=1e-5)
+
+
+def test_the_tip_is_in_millimetres_for_a_known_length(measured: Result) -> None:
+    table = measured[0]
+    assert table.tip_along_mm[0] == pytest.approx(MM, rel=0.02)
+    assert table.tip_across_mm.max() > 0.1 * MM
+
+
+def test_the_clock_of_a_recording_of_the_same_swim_is_found(measured: Result) -> None:
+    table, result, _ = measured
+    assert result["video_begin"] == pytest.approx(-BEGIN, abs=5e-3)
+    assert 0.0 < result["video_begin_ci95"] < 0.01
+    assert (table.elapsed - table.video_time).to_numpy() == pytest.approx(-BEGIN, abs=5e-3)
+
+
+def test_the_figure_has_the_midline_in_the_picture(measured: Result) -> None:
+    picture = cv2.imread(str(measured[2] / "fish.png"))
+    assert picture is not None
+    green = (picture[..., 1] > picture[..., 2] + 80) & (picture[..., 1] > picture[..., 0])
+    assert np.count_nonzero(green) > 200
+
+
+def test_an_interrupted_measurement_goes_on_where_it_ended(
+    video: Path, measured: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add, calls = TailTable.add, count(1)
+
+    def interrupted(table: TailTable, *reading: Any) -> None:
+        if next(calls) > 170:
+            raise KeyboardInterrupt
+        add(table, *reading)
+
+    target = tmp_path / "fish.csv"
+    with monkeypatch.context() as patch:
+        patch.setattr(TailTable, "add", interrupted)
+        done = measure(video, target)
+    assert done.returncode == 130
+    assert "170 pictures are measured; the same command goes on" in done.stderr
+    assert not target.exists()
+    with (tmp_path / "fish.csv.part").open("a") as part:
+        part.write("5.6666,0.1")  # a row that a kill has torn
+    measured_again: list[float] = []
+    monkeypatch.setattr(
+        TailTable, "add", lambda *row: measured_again.append(row[1].time) or add(*row)
+    )
+    assert measure(video, target).returncode == 0
+    assert measured_again[0] == pytest.approx(170 / 30, abs=1e-3)
+    resumed, whole = pandas.read_csv(target), measured[0]
+    assert resumed.fin_angle.equals(whole.fin_angle)
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_the_rate_of_the_command_line_replaces_that_of_the_file(
+    video: Path, measured: Result, tmp_path: Path
+) -> None:
+    learned = measured[2] / "fish.bin"
+    done = measure(video, tmp_path / "slow.csv", "--rate", "15", "--learned", learned, "--json")
+    table = pandas.read_csv(tmp_path / "slow.csv")
+    assert table.video_time.iloc[-1] == pytest.approx((30 * SECONDS - 1) / 15)
+    assert json.loads(done.stdout)["fin_angle_max"] > 0.05
+
+
+def test_a_video_with_the_head_at_the_right_is_turned(tmp_path: Path) -> None:
+    film = FilmedTail(Film(width=320, height=240, motion=rest_before(0.5, sine(0.2))))
+    pictures = [cv2.rotate(shot.picture, cv2.ROTATE_180) for shot in film.shots(0.0, 2.7)]
+    video = write_video(tmp_path / "turned.avi", pictures, 30.0)
+    assert "turn the picture so that the head is at the left" in one_line(
+        measure(video, tmp_path / "a.csv")
+    )
+    done = measure(video, tmp_path / "b.csv", "--rotate", "180", "--json")
+    assert json.loads(done.stdout)["fin_angle_max"] == pytest.approx(0.2, rel=0.01)
+
+
+Make = Callable[[Path], Path]
+
+
+def still(path: Path) -> Path:
+    film = FilmedTail(Film(width=320, height=240, motion=sine(0.0)))
+    return film_video(path / "still.avi", film, 0.0, 3.0)
+
+
+def short(path: Path) -> Path:
+    return film_video(path / "short.avi", FilmedTail(Film(width=320, height=240)), 1.0, 2.0)
+
+
+def raw(path: Path) -> Path:
+    jpeg = cv2.imencode(".jpg", np.zeros((64, 64), np.uint8))[1].tobytes()
+    (path / "raw.mjpeg").write_bytes(20 * jpeg)
+    return path / "raw.mjpeg"
+
+
+def content(text: str) -> Make:
+    def make(path: Path) -> Path:
+        (path / "video.mp4").write_text(text)
+        return path / "video.mp4"
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (content(""), "video.mp4 is empty: give a video file"),
+        (content("no video"), "is not a video, or has a codec that OpenCV cannot read: convert it"),
+        (lambda path: path / "none.mp4", "none.mp4 cannot be read: No such file or directory"),
+        (lambda path: path, " is a folder: give a video file"),
+        (raw, "does not state when its pictures were taken: give their rate, such as --rate 30"),
+        (still, "nothing swings: let the fish swim"),
+        (short, "30 pictures are too few to learn from; 60 are needed"),
+    ],
+    ids=["empty", "no video", "no file", "a folder", "no rate", "at rest", "short"],
+)
+def test_what_cannot_be_measured_is_named_and_leaves_no_file(
+    tmp_path: Path, make: Make, message: str
+) -> None:
+    folder = tmp_path / "result"
+    folder.mkdir()
+    done = measure(make(tmp_path), folder / "fish.csv")
+    assert done.returncode == 1
+    assert message in one_line(done)
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("nowhere/fish.csv", "its folder does not exist; create it"),
+        ("file/fish.csv", "cannot be written: Not a directory"),
+        ("file", "exists already: give another file with --to"),
+    ],
+)
+def test_a_table_that_cannot_be_written_is_refused_before_anything_is_measured(
+    video: Path, tmp_path: Path, table: str, message: str
+) -> None:
+    (tmp_path / "file").write_text("kept")
+    assert message in one_line(measure(video, tmp_path / table))
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_an_unfinished_table_of_something_else_is_kept(video: Path, tmp_path: Path) -> None:
+    part = tmp_path / "fish.csv.part"
+    part.write_text("kept\n")
+    assert "is not an unfinished table: remove it" in one_line(
+        measure(video, tmp_path / "fish.csv")
+    )
+    assert part.read_text() == "kept\n"
+
+
+def test_rows_from_other_options_are_not_mixed(
+    video: Path, measured: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned = "--learned", measured[2] / "fish.bin"
+
+    def full(*_: Any) -> None:
+        raise CannotWriteTable("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TailTable, "add", full)
+        assert "the disk is full" in measure(video, tmp_path / "fish.csv", *learned).stderr
+    done = measure(video, tmp_path / "fish.csv", "--rate", "20", *learned)
+    assert "is from another video or other options: remove it" in one_line(done)
+
+
+def test_a_recording_of_another_swim_costs_no_measurement(
+    video: Path, measured: Result, tmp_path: Path
+) -> None:
+    other = write(tmp_path / "other", swum(20.0, controller="swing"))
+    target, learned = tmp_path / "fish.csv", ("--learned", measured[2] / "fish.bin")
+    done = measure(video, target, "--with", other, *learned)
+    assert "is the recording of this swim" in done.stderr
+    assert "without --with, the same command writes the table" in done.stderr
+    assert measure(video, target, *learned).returncode == 0
+    assert pandas.read_csv(target).fin_angle.equals(measured[0].fin_angle)
+
+
+def test_a_video_of_another_size_than_the_learned_one_is_refused(
+    measured: Result, tmp_path: Path
+) -> None:
+    camera = FilmedTail(Film(width=200, height=150))
+    video = film_video(tmp_path / "small.avi", camera, 0.0, 0.2)
+    done = measure(video, tmp_path / "a.csv", "--learned", measured[2] / "fish.bin")
+    assert "has 200 × 150 pixels, but the tail was learned from 400 × 240" in one_line(done)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("fish.avi",), "--to FILE.csv is needed for the table of a VIDEO"),
+        (("fish.avi", "--to", "a.csv", "--learn"), "--learn needs --learned FILE"),
+        (("fish.avi", "--to", "a.csv", "--for", "9"), "--for is for a camera, not for a VIDEO"),
+        (("--rate", "30"), "--rate is for a VIDEO"),
+    ],
+)
+def test_options_for_something_else_are_refused(words: tuple[str, ...], message: str) -> None:
+    done = fishctl("camera", "measure", *words)
+    assert done.returncode == 2
+    assert message in one_line(done)
