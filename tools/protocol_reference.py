@@ -26,6 +26,7 @@ TYPES = {
     inspect.DictType: "object",
     inspect.LiteralType: "string",
     inspect.StructType: "object",
+    inspect.TupleType: "pair",
     inspect.RawType: "any",
     inspect.AnyType: "any",
 }
@@ -45,6 +46,7 @@ STRUCTS: dict[str, type[Struct]] = {
     "calibrations": protocol.Calibrations,
     "frame": messages.FrameHeader,
     "view": messages.ViewHeader,
+    "tail": messages.TailMessage,
     "camera-state": messages.CameraState,
     "until": messages.Until,
 }
@@ -52,7 +54,7 @@ STRUCTS: dict[str, type[Struct]] = {
 LIKE: dict[str, tuple[str, type[Struct]]] = {
     "status": ("tick", signals.Tick),
     "state": ("status", signals.Status),
-    **dict.fromkeys(("view", "camera-state", "until"), ("frame", messages.FrameHeader)),
+    **dict.fromkeys(("view", "tail", "camera-state", "until"), ("frame", messages.FrameHeader)),
 }
 """Tables that omit the fields of another table, with its name and struct."""
 

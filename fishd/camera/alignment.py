@@ -15,9 +15,10 @@ MAX_OFFSET_PX = 0.5
 """Largest offset of an axis that counts as centred [px]."""
 MAX_TILT_RAD = math.radians(0.5)
 """Largest tilt of an axis that counts as level [rad]."""
-_UPRIGHT_LIKENESS_RATIO = 1.3
+_UPRIGHT_LIKENESS_RATIO = 1.15
 """Ratio of the symmetry of the transposed motion to that of the motion, above which the fish lies
-along the columns of the picture."""
+along the columns of the picture. It is 1.3 for one that does, with a straight fin, and 0.8 for one
+that lies along the rows."""
 _EDGE_FRACTION = 0.1
 """Fraction of the 90 % quantile of the motion; the motion is cut off where a tenth of an edge
 exceeds it."""

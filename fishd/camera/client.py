@@ -1,10 +1,12 @@
 """Client of a running `fishd-camera`: frames with their times on the clock of fishd."""
 
 import time
+from collections import deque
 from collections.abc import Iterator
 from typing import Self
 
 import zmq
+from msgspec.structs import replace
 
 from fishd.camera import messages
 from fishd.camera.clock_offset import ClockOffset, Offset, Reading, clock_reader
@@ -14,6 +16,7 @@ from fishd.camera.messages import (
     FrameHeader,
     PublishedFrame,
     PublishedView,
+    TailMessage,
     Until,
 )
 from fishd.camera.requests import (
@@ -39,6 +42,8 @@ LOCKSTEP_TIMEOUT_S = 5.0
 """Longest time that a tick in lockstep waits for its frames [s]."""
 MAX_QUEUED_MESSAGES = 256
 """Largest number of messages that wait for a busy client."""
+_MAX_WAITING_TAILS = 4096
+"""Largest number of fin angles that wait until they are taken; older ones are dropped."""
 _STATUS_PERIOD_S = 0.5
 """Time without a message in lockstep after which the camera's state is requested [s]."""
 _POLL_PERIOD_S = 0.02
@@ -59,6 +64,7 @@ class CameraClient:
         fish: Fish | None = None,
         stack: StackSettings | None = None,
         views: bool = False,
+        tail: bool = False,
         frames: str | None = None,
         timeout: float = TIMEOUT,
     ) -> None:
@@ -67,6 +73,7 @@ class CameraClient:
         fish: the fishd to whose clock times are converted; None leaves them on the camera's clock
         stack: the frames that `stack_at` returns
         views: whether to receive the JPEG pictures for people, too
+        tail: whether to receive the fin angles, too
         frames: address of the frames; None requests it from the camera
         timeout: longest wait for an answer, or for a frame [s]
 
@@ -80,9 +87,11 @@ class CameraClient:
         """Newest frame as the camera sent it."""
         self.view: PublishedView | None = None
         """Newest picture for people."""
+        self._tails: deque[TailMessage] = deque(maxlen=_MAX_WAITING_TAILS)
         self.missed = 0
         """Number of frames that were sent but did not arrive."""
-        self._requests = CameraRequests(self.endpoint, timeout)
+        self.requests = CameraRequests(self.endpoint, timeout)
+        """Its other requests."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._last_message_time = time.monotonic()
         self._until: float | None = None
@@ -95,8 +104,10 @@ class CameraClient:
             self._session = self.state.session
             self._camera_clock = ClockOffset(self._read_clock)
             self._fishd_clock = ClockOffset(clock_reader(fish)) if fish else None
+            topics = [messages.FRAME, messages.UNTIL, messages.STATE]
+            topics += [messages.VIEW] * views + [messages.TAIL] * tail
             self._subscribe(
-                frames or resolve_frames_address(self.state.frames, self.endpoint), views
+                frames or resolve_frames_address(self.state.frames, self.endpoint), topics
             )
             self._await_subscription()
         except BaseException:
@@ -111,16 +122,16 @@ class CameraClient:
 
     def close(self) -> None:
         """Disconnect; may be called twice."""
-        self._requests.close()
+        self.requests.close()
         self._context.destroy(linger=0)
 
     def status(self) -> CameraState:
         """Return the camera's state; raises `CameraLost`."""
-        return self._requests.status()
+        return self.requests.status()
 
     def settings(self) -> CameraSettings:
         """Return the camera's settings, without a password; raises `CameraLost`."""
-        return self._requests.settings()
+        return self.requests.settings()
 
     def offset(self) -> Offset:
         """Return the offset of fishd's clock from the camera's; raises `FishError`."""
@@ -151,6 +162,12 @@ class CameraClient:
         if not frames and subscription.is_dead():
             subscription.replace(subscription.address)
         return frames
+
+    def take_tails(self) -> list[TailMessage]:
+        """Return the fin angles since the last call that `poll` has received, times as frames'."""
+        tails = list(self._tails)
+        self._tails.clear()
+        return tails
 
     def frames(self) -> Iterator[Frame]:
         """Yield every frame from now on; raises `CameraLost` when none arrives in time."""
@@ -252,16 +269,14 @@ class CameraClient:
         problem = "; ".join(filter(None, (self.state.problem, self.state.remedy)))
         return f": {text.line(problem)}" if problem else ""
 
-    def _subscribe(self, address: str, views: bool) -> None:
-        topics = [messages.FRAME, messages.UNTIL, messages.STATE]
-
+    def _subscribe(self, address: str, topics: list[bytes]) -> None:
         def open_socket(address: str) -> "zmq.Socket[bytes]":
             socket = self._context.socket(zmq.SUB)
             socket.set(zmq.RCVHWM, MAX_QUEUED_MESSAGES)
             socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
             socket.set(zmq.RECONNECT_IVL, 20)
             socket.set(zmq.RECONNECT_IVL_MAX, 500)
-            for topic in [*topics, messages.VIEW] if views else topics:
+            for topic in topics:
                 socket.subscribe(topic)
             connect(socket, address)
             return socket
@@ -296,6 +311,8 @@ class CameraClient:
                     frames.append((message.header, frame))
             elif isinstance(message, PublishedView):
                 self.view = message
+            elif isinstance(message, TailMessage):
+                self._store_tail(message)
             elif isinstance(message, Until):
                 self._enter(message.session)
                 self._until, self._until_moved = message.until, True
@@ -313,7 +330,7 @@ class CameraClient:
             self.missed += max(0, header.seq - self.latest.header.seq - 1)
         self.latest = published
         self._last_seq = max(self._last_seq, header.seq)
-        offset = self._seconds_to_add(header)
+        offset = self._seconds_to_add(header.virtual)
         if offset is None:
             return None
         self._last_message_time = time.monotonic()
@@ -321,12 +338,19 @@ class CameraClient:
         self.history.add(frame)
         return frame
 
-    def _seconds_to_add(self, header: FrameHeader) -> float | None:
-        """Return the offset for a frame's times [s]; None where unknown.
+    def _store_tail(self, tail: TailMessage) -> None:
+        self._enter(tail.session)
+        virtual = self.latest.header.virtual if self.latest else self.state.virtual
+        offset = self._seconds_to_add(virtual)
+        if offset is not None:
+            self._tails.append(replace(tail, time=tail.time + offset))
+
+    def _seconds_to_add(self, virtual: bool) -> float | None:
+        """Return the offset for times of the camera [s]; None where unknown.
 
         Raises `FishError` where a clock has never answered.
         """
-        if header.virtual:
+        if virtual:
             return 0.0
         try:
             return self.offset().seconds
@@ -354,7 +378,7 @@ class CameraClient:
                 self._fishd_clock.forget()
 
     def _read_clock(self, patience: float | None) -> Reading:
-        state = self._requests.status(patience)
+        state = self.requests.status(patience)
         if state.clock is None:
             raise CameraLost(
                 f"the camera at {self.endpoint} does not tell its clock yet: it is {state.state}"

@@ -11,12 +11,15 @@ from fishd.camera.messages import Crop, PublishedView
 from fishd.core.camera_frames import Pixels
 from fishd.core.errors import FishdError
 from fishd.core.files import write_atomically
+from fishd.core.tail_reading import TailReading
 
 Colours = NDArray[np.uint8]
 """Red, green and blue of each pixel, shape (height, width, 3)."""
 
 AXIS_COLOUR = (255, 90, 60)
 """Colour of the axis."""
+MIDLINE_COLOUR = (90, 255, 120)
+"""Colour of the midline of the tail."""
 CROP_COLOUR = (90, 200, 255)
 """Colour of the outline of the part that frames show."""
 _ENLARGED_SIZE_PX = 640
@@ -64,6 +67,23 @@ def draw_axis(colours: Colours, axis: Axis | None, size: int, crop: Crop | None 
         ends = point(0.0, float(rows[0])), point(size - 1.0, float(rows[-1]))
         thickness = max(1, min(height, width) // 240)
         cv2.line(drawn, *ends, AXIS_COLOUR, thickness, cv2.LINE_AA if thickness > 1 else cv2.LINE_8)
+    return drawn
+
+
+def draw_midline(colours: Colours, tail: TailReading | None, width: int) -> Colours:
+    """Return a whole picture with the midline of the tail drawn in.
+
+    tail: latest reading; None draws nothing
+    width: width of the pictures in whose pixels the midline is [px]
+    """
+    if tail is None or not tail.midline:
+        return colours
+    drawn = np.ascontiguousarray(colours)
+    scale = drawn.shape[1] / max(1, width)
+    points = (np.array(tail.midline) + 0.5) * scale - 0.5
+    cv2.polylines(
+        drawn, [np.rint(points * 16).astype(np.int32)], False, MIDLINE_COLOUR, 2, cv2.LINE_AA, 4
+    )
     return drawn
 
 

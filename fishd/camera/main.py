@@ -60,6 +60,7 @@ def camera(path: Path | None, overrides: tuple[str, ...], log_format: str) -> in
     """
     settings = load(path, overrides)
     try:
+        from fishd.camera.measuring import learned_path
         from fishd.camera.server import Server
 
         source = open_source(settings)
@@ -72,7 +73,7 @@ def camera(path: Path | None, overrides: tuple[str, ...], log_format: str) -> in
         logging.getLogger("linuxpy").setLevel(logging.WARNING)
         if path is not None:
             warn_of_readers(path, settings)
-        with Server(settings, source) as server:
+        with Server(settings, source, learned_path(settings, path)) as server:
             server.run(stopping.is_set)
 
     return run_service(NAME, log_format, serve)

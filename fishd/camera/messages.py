@@ -1,7 +1,8 @@
-"""Messages of `fishd-camera`: frames, views for people, its state; see docs/how-to/camera.md.
+"""Messages of `fishd-camera`: frames, views for people, fin angles, its state.
 
 Each message of the PUB socket is a topic and one JSON object, followed by the picture in a frame or
-a view. Requests have the format of fishd's control protocol (`fishd.core.protocol`).
+a view; docs/reference/protocol.md has the fields. Requests have the format of fishd's control
+protocol (`fishd.core.protocol`).
 """
 
 from collections.abc import Callable, Sequence
@@ -13,11 +14,12 @@ from msgspec import Meta, Struct
 
 from fishd.core.camera_frames import Pixels
 from fishd.core.decoding import decoder
-from fishd.core.errors import FishdError
+from fishd.core.errors import FishdError, Refused
 from fishd.core.schema import note, unit
+from fishd.core.tail_reading import TailReading
 
 VERSION = 2
-FRAME, VIEW, STATE, UNTIL = b"frame", b"view", b"state", b"until"
+FRAME, VIEW, TAIL, STATE, UNTIL = b"frame", b"view", b"tail", b"state", b"until"
 """Topics of the messages."""
 MAX_FRAME_SIZE_PX = 256
 """Largest height and width of a frame [px]."""
@@ -35,8 +37,8 @@ _Session = Annotated[
         "Identifier of a run of the camera on one clock; in a new one, times and numbers restart."
     ),
 ]
-_Width = Annotated[int, unit("px", "Columns of the picture.", ge=1, le=8192)]
-_Height = Annotated[int, unit("px", "Rows of the picture.", ge=1, le=8192)]
+_Width = Annotated[int, unit("px", "Columns.", ge=1, le=8192)]
+_Height = Annotated[int, unit("px", "Rows.", ge=1, le=8192)]
 _FrameTime = Annotated[
     float,
     unit(
@@ -57,21 +59,19 @@ class FrameHeader(Struct, frozen=True, kw_only=True, gc=False):
 
     v: _Version = VERSION
     session: _Session
-    seq: Annotated[
-        int, note("Number of the frame in its session, from 1; a gap means that messages were lost")
-    ]
+    seq: Annotated[int, note("Number of the frame in its session, from 1; gaps are lost messages")]
     time: _FrameTime
     available: Annotated[
         float,
-        unit("s", "Time at which the frame became available, on the same clock.", **_TIME_RANGE),
+        unit("s", "Time at which the frame was available, on that clock.", **_TIME_RANGE),
     ]
     exposure: Annotated[float | None, unit("s", "Exposure time; null where it is unknown.")] = None
     dropped_frames: Annotated[
-        int, note("Number of frames that were taken but not delivered, since start.", ge=0)
+        int, note("Frames that were taken but not delivered, since start.", ge=0)
     ] = 0
     virtual: Annotated[bool, note("True where the clock is the virtual one of a lockstep.")] = False
-    width: Annotated[int, unit("px", "Columns of the picture.", ge=1, le=MAX_FRAME_SIZE_PX)]
-    height: Annotated[int, unit("px", "Rows of the picture.", ge=1, le=MAX_FRAME_SIZE_PX)]
+    width: Annotated[int, unit("px", "Columns.", ge=1, le=MAX_FRAME_SIZE_PX)]
+    height: Annotated[int, unit("px", "Rows.", ge=1, le=MAX_FRAME_SIZE_PX)]
 
 
 class Crop(Struct, frozen=True, kw_only=True):
@@ -88,15 +88,25 @@ class ViewHeader(Struct, frozen=True, kw_only=True):
 
     v: _Version = VERSION
     session: _Session
-    seq: Annotated[int, note("Number of the frame that was taken from the same picture.")]
+    seq: Annotated[int, note("Number of the frame from the same picture.")]
     time: _FrameTime
     width: _Width
     height: _Height
     crop: Annotated[
         Crop,
-        note(
-            "The part that frames show: `left`, `top`, `width`, `height`, as fractions of the view."
-        ),
+        note("Part that frames show: `left`, `top`, `width`, `height`, in fractions of the view."),
+    ]
+
+
+class TailMessage(TailReading, frozen=True, kw_only=True):
+    """Topic `tail`: what a whole picture shows of the tail."""
+
+    v: _Version = VERSION
+    session: _Session
+    seq: Annotated[int, note("Number of the frame from the same picture.")]
+    time: Annotated[
+        float,
+        unit("s", "Middle of the exposure of the fin's row, on the camera's clock.", **_TIME_RANGE),
     ]
 
 
@@ -113,13 +123,16 @@ CONDITIONS: dict[Condition, str] = {
     "starting": "the process has just begun",
     "waiting": "a simulated camera waits for a fishd that ticks",
     "streaming": "frames arrive",
-    "stalled": "the camera is connected, but no complete frame has arrived for a while; it is "
-    "opened again",
-    "unplugged": "there is no such camera, file or stream; fishd-camera keeps looking for it",
+    "stalled": "the camera is connected, but no frame has come for a while; it is opened again",
+    "unplugged": "there is no such camera, file or stream; fishd-camera keeps looking",
     "unusable": "it cannot be used with these settings; fishd-camera keeps trying",
     "ended": "the file is at its end, and is not repeated",
 }
 """Conditions of a camera and their meanings."""
+
+
+TailCondition = Literal["off", "unlearned", "learning", "measuring", "unusable"]
+"""Condition of the measurement of the fin angle."""
 
 
 class CameraState(Struct, frozen=True, kw_only=True):
@@ -138,25 +151,23 @@ class CameraState(Struct, frozen=True, kw_only=True):
     problem: Annotated[str, note("Reason in one line; empty while frames arrive.")] = ""
     remedy: Annotated[str, note("Instruction that solves the problem.")] = ""
     limitations: Annotated[
-        tuple[str, ...], note("Reasons why the times or pictures are worse than possible.")
+        tuple[str, ...], note("Why times or pictures are worse than possible.")
     ] = ()
     rate: Annotated[float, unit("1/s", "Recent frames per second; 0.0 where none arrive.")] = 0.0
     latency: Annotated[
         float | None,
-        unit("s", "Recent mean time from the middle of the exposure until the frame is available."),
+        unit("s", "Recent mean time from exposure until the frame is available."),
     ] = None
-    exposure: Annotated[float | None, unit("s", "Exposure time; null: unknown.")] = None
+    exposure: Annotated[float | None, unit("s", "Exposure time; null where it is unknown.")] = None
     seq: Annotated[int, note("Number of the latest frame; 0: none yet.")] = 0
     dropped_frames: Annotated[
-        int, note("Number of frames that were taken but not delivered, since start.")
+        int, note("Frames that were taken but not delivered, since start.")
     ] = 0
-    broken_frames: Annotated[
-        int, note("Number of frames that could not be decoded, since start.")
-    ] = 0
-    width: Annotated[int, unit("px", "Width of frames.")]
-    height: Annotated[int, unit("px", "Height of frames.")]
-    picture_width: Annotated[int, unit("px", "Width of the camera's whole pictures; 0: none yet.")]
-    picture_height: Annotated[int, unit("px", "Height of the camera's whole pictures.")]
+    broken_frames: Annotated[int, note("Frames that could not be decoded, since start.")] = 0
+    width: Annotated[int, unit("px", "Columns.")]
+    height: Annotated[int, unit("px", "Rows.")]
+    picture_width: Annotated[int, unit("px", "Width of whole pictures; 0: none yet.")]
+    picture_height: Annotated[int, unit("px", "Height of whole pictures.")]
     virtual: Annotated[bool, note("True where the clock is the virtual one of a lockstep.")] = False
     until: Annotated[
         Annotated[float, Meta(**_TIME_RANGE)] | None,
@@ -164,12 +175,38 @@ class CameraState(Struct, frozen=True, kw_only=True):
     ] = None
     clock: Annotated[
         Annotated[float, Meta(**_TIME_RANGE)] | None,
-        unit("s", "Current time of the camera's clock; null where virtual, or unknown yet."),
+        unit("s", "Camera's clock now; null where virtual or unknown."),
     ] = None
-    boot_id: Annotated[
-        str, note("Identifier of the boot of the machine from which that clock counts.")
-    ] = ""
+    boot_id: Annotated[str, note("Identifier of the boot from which that clock counts.")] = ""
     frames: Annotated[str, note("Address of the PUB socket.")]
+    tail: Annotated[
+        TailCondition,
+        note(
+            "`off`, `unlearned`, `learning`, `measuring`, or `unusable`: its file cannot be used."
+        ),
+    ] = "off"
+    tail_problem: Annotated[
+        str, note("Why it does not measure, or has not learned; else empty.")
+    ] = ""
+    tail_learned: Annotated[str, note("Date of learning; empty: never.")] = ""
+    tail_zero_ci95: Annotated[
+        float | None, unit("rad", "Half-width of the 95 % interval of the learned zero.")
+    ] = None
+    measured_pictures: Annotated[int, note("Measured pictures, since start.")] = 0
+    unmeasured_pictures: Annotated[
+        int, note("Pictures without time to measure them, since start.")
+    ] = 0
+
+    def refuse_unmeasured(self) -> None:
+        """Raise `Refused` where the camera does not measure the fin angle."""
+        if self.tail in ("measuring", "learning"):
+            return
+        remedies = {
+            "off": "tail.measure is false in its settings",
+            "unlearned": "it has not learned the tail: run 'fishctl camera measure --learn'",
+        }
+        reason = self.tail_problem or remedies.get(self.tail, self.tail)
+        raise Refused("tail-unknown", f"this camera measures no fin angle: {reason}")
 
 
 class PublishedFrame(NamedTuple):
@@ -186,7 +223,7 @@ class PublishedView(NamedTuple):
     jpeg: bytes
 
 
-Message = PublishedFrame | PublishedView | CameraState | Until
+Message = PublishedFrame | PublishedView | TailMessage | CameraState | Until
 
 _encode = msgspec.json.Encoder().encode
 
@@ -206,6 +243,11 @@ def encode_state(state: CameraState) -> list[bytes]:
     return [STATE, _encode(state)]
 
 
+def encode_tail(tail: TailMessage) -> list[bytes]:
+    """Return the parts of a message with a fin angle."""
+    return [TAIL, _encode(tail)]
+
+
 def encode_until(until: Until) -> list[bytes]:
     """Return the parts of a message `until`."""
     return [UNTIL, _encode(until)]
@@ -214,6 +256,7 @@ def encode_until(until: Until) -> list[bytes]:
 _decoders: dict[bytes, Any] = {
     FRAME: decoder(FrameHeader),
     VIEW: decoder(ViewHeader),
+    TAIL: decoder(TailMessage),
     STATE: decoder(CameraState),
     UNTIL: decoder(Until),
 }
@@ -241,7 +284,9 @@ def decode(parts: Sequence[bytes]) -> Message:
                 f"a message of topic {name} in version {version}; version {VERSION} is needed: "
                 "install the same version of fishd for camera and client"
             )
-        header: FrameHeader | ViewHeader | CameraState | Until = _decoders[topic](parts[1])
+        header: FrameHeader | ViewHeader | TailMessage | CameraState | Until = _decoders[topic](
+            parts[1]
+        )
     except msgspec.DecodeError as error:
         raise BadMessage(f"a message of topic {name} that cannot be read: {error}") from None
     if isinstance(header, FrameHeader):

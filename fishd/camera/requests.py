@@ -66,6 +66,14 @@ class CameraRequests:
         """Return the camera's settings, without a password."""
         return self._call(CameraSettings, "config")
 
+    def learn_tail(self) -> CameraState:
+        """Let the camera collect pictures of the fish from now on, to learn its tail."""
+        return self._call(CameraState, "learn_tail")
+
+    def finish_tail(self) -> CameraState:
+        """Let the camera learn from these pictures; its state says when it has done so."""
+        return self._call(CameraState, "finish_tail")
+
     def _call(self, kind: type[T], op: str, timeout: float | None = None) -> T:
         """Send a request and return its result; raises `CameraLost` and `Refused`."""
         identity = next(self._ids)

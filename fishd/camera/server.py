@@ -7,12 +7,15 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Self
 
 import zmq
+from msgspec.structs import replace
 
 from fishd.camera import messages, picture
-from fishd.camera.messages import FrameHeader, Until, ViewHeader
+from fishd.camera.measuring import Measuring
+from fishd.camera.messages import CameraState, FrameHeader, TailMessage, Until, ViewHeader
 from fishd.camera.monitor import Monitor
 from fishd.camera.settings import CameraSettings, without_password
 from fishd.camera.sockets import Publisher, Requests
@@ -45,7 +48,8 @@ class Server:
     It is the sink of its source: the calls of the source wait in one queue, in their order.
     """
 
-    def __init__(self, settings: CameraSettings, source: Source) -> None:
+    def __init__(self, settings: CameraSettings, source: Source, learned: Path) -> None:
+        """learned: file of what was learned of the tail"""
         self._settings = settings
         self._source = source
         self._queue: deque[Callable[[], None]] = deque()
@@ -56,6 +60,7 @@ class Server:
         """Latest unexpected error of the source."""
         self._sessions = 0
         self._next_view = self._next_state = 0.0
+        self._measuring = Measuring(settings, learned, self._publish_tail)
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -69,9 +74,12 @@ class Server:
             self._monitor = Monitor(self._settings, self._source.device, self._publisher.address)
             self._monitor.session = self._new_session()
             self._requests.operations = {
-                "status": self._monitor.state,
+                "status": self._state,
                 "config": lambda: without_password(self._settings),
+                "learn_tail": self._begin_learning,
+                "finish_tail": self._finish_learning,
             }
+            stack.enter_context(self._measuring)
             self._stack = stack.pop_all()
         return self
 
@@ -202,6 +210,11 @@ class Server:
     def _wake(self) -> None:
         os.eventfd_write(self._job_event, 1)
 
+    def _publish_tail(self, tail: TailMessage) -> None:
+        """Queue a fin angle; called in the thread that measures."""
+        self._queue.append(lambda: self._publisher.send(messages.encode_tail(tail)))
+        self._wake()
+
     # The rest runs in the thread of the sockets.
 
     def _run_jobs(self) -> None:
@@ -226,6 +239,7 @@ class Server:
             height=pixels.shape[0],
         )
         self._publisher.send(messages.encode_frame(header, pixels))
+        self._measuring.offer(monitor.session, monitor.seq, shot.time, shot.picture)
         self._publish_view(shot)
         if changed:
             self._publish_state(True)
@@ -267,7 +281,28 @@ class Server:
             log.log(level, "%s", line)
             self._notifier.status(line)
         self._next_state = time.monotonic() + STATE_PERIOD
-        self._publisher.send(messages.encode_state(self._monitor.state()))
+        self._publisher.send(messages.encode_state(self._state()))
+
+    def _begin_learning(self) -> CameraState:
+        self._measuring.begin_learning()
+        return self._state()
+
+    def _finish_learning(self) -> CameraState:
+        self._measuring.finish_learning()
+        return self._state()
+
+    def _state(self) -> CameraState:
+        """Return the state of the camera, and of the measurement of the tail."""
+        measuring, learned = self._measuring, self._measuring.learned
+        return replace(
+            self._monitor.state(),
+            tail=measuring.condition,
+            tail_problem=measuring.problem,
+            tail_learned=learned.date if learned else "",
+            tail_zero_ci95=learned.zero_ci95 if learned else None,
+            measured_pictures=measuring.measured,
+            unmeasured_pictures=measuring.dropped,
+        )
 
     def _new_session(self) -> str:
         self._sessions += 1

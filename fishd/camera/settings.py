@@ -20,8 +20,7 @@ _Delay = Annotated[
     float,
     unit(
         "s",
-        "Delay of a frame's time stamp after the middle of its exposure, in addition to the "
-        "delay that follows from the exposure time.",
+        "Delay of time stamps after the middle of the exposure, beyond that by its duration.",
         ge=-1,
         le=5,
     ),
@@ -37,7 +36,7 @@ class V4l2Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     device: Annotated[
         str,
         note(
-            "Device file of the camera: /dev/video0, or a persistent name in /dev/v4l/by-id.",
+            "Device file: /dev/video0, or a persistent name in /dev/v4l/by-id.",
             min_length=1,
             max_length=500,
             pattern=PRINTABLE,
@@ -48,13 +47,13 @@ class V4l2Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     rate: Annotated[float, unit("1/s", "Frames per second.", gt=0, le=1000)] = 30.0
     format: Annotated[
         Literal["MJPG", "YUYV", "GREY"],
-        note("Pixel format; most web cameras reach their full rate with MJPG only."),
+        note("Pixel format; most web cameras are fast with MJPG only."),
     ] = "MJPG"
     controls: Annotated[
         dict[str, Any],
         note(
-            "Controls to set, by the names that 'v4l2-ctl --list-ctrls' shows, such as "
-            "auto_exposure: 1. A fixed exposure and gain keep brightness and rate constant."
+            "Controls by the names of 'v4l2-ctl --list-ctrls', such as auto_exposure: 1; a fixed "
+            "exposure and gain keep brightness and rate constant."
         ),
     ] = {}
     delay: _Delay = 0.0
@@ -71,7 +70,7 @@ class StreamSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     ] = None
     rate: Annotated[
         Annotated[float, Meta(gt=0, le=1000)] | None,
-        unit("1/s", "Frames per second of a file; null: the rate that the file states."),
+        unit("1/s", "Frames per second of a file; null: as it states."),
     ] = None
     loop: Annotated[bool, note("Whether to repeat a file.")] = True
     delay: _Delay = 0.0
@@ -80,9 +79,11 @@ class StreamSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 class SimulatedSettings(SimulatedCameraSettings, frozen=True, kw_only=True):
     """Settings of a camera above a simulated fish, which draws the tail from fishd's telemetry."""
 
+    width: Annotated[int, unit("px", "Width of a picture.", ge=16, le=1920)] = 640
+    height: Annotated[int, unit("px", "Height of a picture.", ge=16, le=1080)] = 480
     fishd: Annotated[
         str | None,
-        note("Control address of fishd; null: the address that fishctl uses on this machine."),
+        note("Control address of fishd; null: that of fishctl."),
     ] = None
 
 
@@ -112,26 +113,48 @@ class PictureSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     ] = 84
 
 
+class TailSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Settings of the measurement of the fin angle in whole pictures."""
+
+    measure: Annotated[
+        bool,
+        note("Whether to measure, once the tail is learned."),
+    ] = True
+    learned: Annotated[
+        _Text | None,
+        note(
+            "File of what was learned; null: one per settings file, in ~/.local/state/fishd, or "
+            "for the service /var/lib/fishd-camera."
+        ),
+    ] = None
+    read_out: Annotated[
+        float,
+        unit(
+            "s",
+            "Time from the exposure of the first row to that of the last.",
+            ge=0,
+            le=0.2,
+        ),
+    ] = 0.0
+
+
 class PublishSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Addresses at which frames are published and requests are answered."""
 
     frames: Annotated[
         str,
         note(
-            "ZeroMQ address of the PUB socket: tcp://HOST:PORT or ipc://PATH. Every program that "
-            "can connect receives the camera's pictures."
+            "ZeroMQ address of the PUB socket: tcp://HOST:PORT or ipc://PATH; all that can connect "
+            "receive the pictures."
         ),
     ] = "tcp://127.0.0.1:9874"
-    requests: Annotated[str, note("ZeroMQ address of the socket for requests, likewise.")] = (
-        "tcp://127.0.0.1:9875"
-    )
+    requests: Annotated[str, note("The same for requests.")] = "tcp://127.0.0.1:9875"
     view_rate: Annotated[
-        float, unit("1/s", "Largest number of pictures for people per second; 0: none.", ge=0, le=5)
+        float,
+        unit("1/s", "Views (for people) per second; 0: none.", ge=0, le=5),
     ] = 5.0
-    view_width: Annotated[
-        int, unit("px", "Largest width of pictures for people.", ge=84, le=1920)
-    ] = 480
-    view_quality: Annotated[int, note("JPEG quality of pictures for people.", ge=10, le=100)] = 80
+    view_width: Annotated[int, unit("px", "Largest width of views.", ge=84, le=1920)] = 480
+    view_quality: Annotated[int, note("JPEG quality of views.", ge=10, le=100)] = 80
 
 
 class CameraSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -150,6 +173,7 @@ class CameraSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         PictureSettings,
         note("The part of the picture that frames show; learning in simulation does not use it."),
     ] = PictureSettings()
+    tail: Annotated[TailSettings, note("Measurement of the fin angle.")] = TailSettings()
     publish: Annotated[PublishSettings, note("Addresses of frames and requests.")] = (
         PublishSettings()
     )

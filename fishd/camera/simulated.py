@@ -1,7 +1,8 @@
 """Simulated camera, which draws the tail for a fin angle and a light.
 
-The fish's axis runs along the rows of the picture, its head to the left; a fin angle α > 0 bends
-the tail towards the higher rows. Each column of pixels crosses the tail in one strip.
+The fish's axis runs along the rows of the picture, its head to the left. The tail is a skeleton
+that bends evenly from the body to the fin's root, and a straight fin at the angle α to the axis, as
+docs/how-to/camera.md defines it; α > 0 bends the tail towards the higher rows.
 """
 
 import math
@@ -24,17 +25,19 @@ from fishd.core.schema import note, unit
 from fishd.core.signals import Truth
 
 PIVOT, LENGTH = 0.14, 0.74
-"""Column of the tail's root and length of the tail, as fractions of the picture's width."""
+"""Column of the tail's root and length of the tail, as fractions of the middle square's side."""
+SKELETON = 0.3
+"""Length of the skeleton, as a fraction of the tail's length; the rest is the fin."""
 ROOT_HALF_THICKNESS, TIP_HALF_THICKNESS = 0.055, 0.018
-"""Half of the tail's thickness at its root and at its tip, as fractions of the width."""
+"""Half of the tail's thickness at its root and at its tip, as fractions of that side."""
 WATER_LEVEL = 180.0
 """Grey level of the water."""
-_POOL_SIZE = 4
-"""Height and width of the pool of noise, in picture sizes."""
+_NOISE_SHIFTS = 252
+"""Number of places in the pool of noise at which a picture may begin, in each direction."""
 _RIPPLE_LENGTH = 0.1
-"""Length of the caustics' ripples, as a fraction of the width."""
+"""Length of the caustics' ripples, as a fraction of the middle square's side."""
 _PATTERN_VELOCITIES = ((0.31, 0.17), (-0.23, 0.29))
-"""Velocities of the two patterns that add up to the caustics [widths/s]."""
+"""Velocities of the two patterns that add up to the caustics [sides/s]."""
 _LIGHT_PERIOD = 23.0
 """Period of the slow drift of the light [s]."""
 
@@ -50,7 +53,7 @@ class SimulatedCameraSettings(Struct, frozen=True, forbid_unknown_fields=True, k
     ] = None
     latency: Annotated[
         float,
-        unit("s", "Time from the middle of the exposure until the frame is available.", ge=0, le=1),
+        unit("s", "Time from exposure until the frame is available.", ge=0, le=1),
     ] = 0.03
     jitter: Annotated[float, unit("s", "Standard deviation of the latency.", ge=0, le=0.2)] = 0.0
     exposure: Annotated[float, unit("s", "Exposure time.", ge=0, le=0.2)] = 0.01
@@ -109,87 +112,104 @@ WEB = SimulatedCameraSettings(
 class TailPainter:
     """Painter of pictures, each with independent noise."""
 
-    def __init__(self, settings: SimulatedCameraSettings, size: int) -> None:
-        """size: height and width of a picture [px]"""
+    def __init__(
+        self, settings: SimulatedCameraSettings, width: int, height: int | None = None
+    ) -> None:
+        """width, height: size of a picture [px]; without a height, it is a square"""
         self._settings = settings
-        self._size = size
+        height = height or width
+        self._shape, self._side = (height, width), min(height, width)
+        side = self._side
         self._random = np.random.default_rng(settings.seed)
-        columns = np.arange(size, dtype=np.float32)
-        along = np.clip((columns - PIVOT * size) / (LENGTH * size), 0.0, None)
-        first, last = round(PIVOT * size), round((PIVOT + LENGTH) * size)
-        self._tail = slice(first, last)
-        place = along[self._tail]
-        self._bend = (LENGTH * size * 0.5 * place * (1.0 + place)).astype(np.float32)
-        """Lateral shift of each column of the tail for tan α = 1 [px]."""
-        self._half = (
-            size * (ROOT_HALF_THICKNESS + (TIP_HALF_THICKNESS - ROOT_HALF_THICKNESS) * place)
-        ).astype(np.float32)
-        axis = (
-            0.5 * (size - 1)
-            + settings.off_axis
-            + math.tan(settings.tilt) * (columns - 0.5 * (size - 1))
-        )
-        self._distance = (columns[:, None] - axis[None, :]).astype(np.float32)
-        """Distance of each pixel from the axis, positive below it, shape (size, size) [px]."""
+        cos, sin = math.cos(settings.tilt), math.sin(settings.tilt)
+        x = np.arange(width) - 0.5 * (width - 1)
+        y = np.arange(height)[:, None] - 0.5 * (height - 1) - settings.off_axis
+        self._distance = (y * cos - x * sin).astype(np.float32)
+        """Distance of each pixel from the axis, positive below it [px]."""
+        place = (x * cos + y * sin + 0.5 * (side - 1) - PIVOT * side) / (LENGTH * side)
+        self._is_body = (place < 0.0) & (np.abs(self._distance) < ROOT_HALF_THICKNESS * side)
+        is_tail = (place >= 0.0) & (place <= 1.0)
+        columns = np.flatnonzero(is_tail.any(axis=0))
+        self._tail = slice(columns[0], columns[-1] + 1)
+        if not settings.tilt:  # one row stands for all
+            place, is_tail = place[:1], is_tail[:1]
+        place, is_tail = place[:, self._tail].clip(0.0, 1.0), is_tail[:, self._tail]
+        skeleton = np.minimum(place, SKELETON)
+        bend = LENGTH * side * (place - skeleton + skeleton**2 / (2.0 * SKELETON))
+        self._bend = bend.astype(np.float32)
+        """Lateral shift of the tail, at each pixel's place along it, for tan α = 1 [px]."""
+        thickness = ROOT_HALF_THICKNESS + (TIP_HALF_THICKNESS - ROOT_HALF_THICKNESS) * place
+        self._half = (side * thickness * is_tail).astype(np.float32)
+        middle, reach = 0.5 * (height - 1) + settings.off_axis, abs(sin) * side
+        self._rows = middle - reach, middle + reach
+        """Rows between which the fish lies at rest [px]."""
         self._still = self._background()
         self._noise = self._pool(settings.noise)
         self._caustics = [self._ripples() for _ in _PATTERN_VELOCITIES] if settings.caustics else []
         self._phase = float(self._random.uniform(0.0, math.tau))
-        self._picture = np.empty((size, size), np.float32)
+        self._picture = np.empty(self._shape, np.float32)
 
     def paint(self, alpha: float, alpha_rate: float, time: float) -> Pixels:
         """Return the picture at `time` [s] of a tail at α [rad] that moves with α̇ [rad/s]."""
-        settings, size, picture = self._settings, self._size, self._picture
+        settings, side, picture = self._settings, self._side, self._picture
+        height, width = self._shape
         np.copyto(picture, self._still)
-        picture[:, self._tail] -= settings.contrast * self._coverage(alpha, alpha_rate)
+        self._draw_tail(picture, alpha, alpha_rate)
         for pattern, (across, down) in zip(self._caustics, _PATTERN_VELOCITIES, strict=False):
-            x, y = int(across * size * time) % size, int(down * size * time) % size
-            picture += pattern[y : y + size, x : x + size]
+            x, y = int(across * side * time) % width, int(down * side * time) % height
+            picture += pattern[y : y + height, x : x + width]
         if settings.light_drift:
             swing = math.sin(math.tau * time / _LIGHT_PERIOD + self._phase)
             picture *= 1.0 + settings.light_drift * swing
         if settings.noise:
-            y, x = self._random.integers(size * (_POOL_SIZE - 1), size=2).tolist()
-            picture += self._noise[y : y + size, x : x + size]
+            y, x = self._random.integers(_NOISE_SHIFTS, size=2).tolist()
+            picture += self._noise[y : y + height, x : x + width]
         np.clip(picture, 0.0, 255.0, out=picture)
         return picture.astype(np.uint8)
 
-    def _coverage(self, alpha: float, alpha_rate: float) -> Array:
-        """Return the fraction of each pixel that the tail covers during the exposure.
+    def _draw_tail(self, picture: Array, alpha: float, alpha_rate: float) -> None:
+        """Darken each pixel by the fraction of it that the tail covers during the exposure.
 
         The tail's edge is a ramp, as wide as one pixel plus the motion during the exposure.
         """
         slope = math.tan(alpha)
         motion = alpha_rate * (1.0 + slope * slope) * self._settings.exposure
-        sharp = 1.0 / np.sqrt(1.0 + (motion * self._bend) ** 2)
-        off = (self._distance[:, self._tail] - slope * self._bend) * sharp
-        half = self._half * sharp
-        upper = np.clip(off + (half + 0.5), 0.0, 1.0)
-        covered: Array = upper - np.clip(off - (half - 0.5), 0.0, 1.0)
-        return covered
+        longest = float(self._bend.max())
+        room = ROOT_HALF_THICKNESS * self._side + abs(motion) * longest + 2.0
+        first, last = self._rows
+        rows = slice(
+            max(0, int(first + min(0.0, slope * longest) - room)),
+            max(0, int(last + max(0.0, slope * longest) + room)),
+        )
+        same = slice(None) if len(self._bend) == 1 else rows
+        bend, half = self._bend[same], self._half[same]
+        sharp = 1.0 / np.sqrt(1.0 + (motion * bend) ** 2)
+        off = (self._distance[rows, self._tail] - slope * bend) * sharp
+        half = half * sharp
+        covered = np.clip(off + (half + 0.5), 0.0, 1.0)
+        covered -= np.clip(off - (half - 0.5), 0.0, 1.0)
+        picture[rows, self._tail] -= self._settings.contrast * covered
 
     def _background(self) -> Array:
-        """Return the picture of the water, the side light and the body, which does not move.
+        """Return the picture of the water with its side light, and of the body, which is still.
 
         It includes 0.5 grey levels, because levels are rounded down later.
         """
-        settings, size = self._settings, self._size
-        still = WATER_LEVEL + settings.side_light / size * self._distance + 0.5
-        body = np.abs(self._distance[:, : self._tail.start]) < size * ROOT_HALF_THICKNESS
-        still[:, : self._tail.start] -= settings.contrast * body
-        return still.astype(np.float32)
+        settings, side = self._settings, self._side
+        still = WATER_LEVEL + settings.side_light / side * self._distance + 0.5
+        return (still - settings.contrast * self._is_body).astype(np.float32)
 
     def _pool(self, deviation: float) -> Array:
-        side = self._size * _POOL_SIZE
-        return (deviation * self._random.standard_normal((side, side))).astype(np.float32)
+        height, width = self._shape
+        shape = height + _NOISE_SHIFTS, width + _NOISE_SHIFTS
+        return (deviation * self._random.standard_normal(shape)).astype(np.float32)
 
     def _ripples(self) -> Array:
-        """Return a smooth random pattern with a period of `size` pixels in both directions."""
-        size = self._size
+        """Return a smooth random pattern that repeats after the picture in both directions."""
         # Relative to the frequency of a ripple.
-        waves = np.fft.fftfreq(size, 1.0 / (size * _RIPPLE_LENGTH))
-        square = waves[:, None] ** 2 + waves[None, :] ** 2
-        spectrum = np.fft.fft2(self._random.standard_normal((size, size)))
+        down, across = (np.fft.fftfreq(n, 1.0 / (self._side * _RIPPLE_LENGTH)) for n in self._shape)
+        square = down[:, None] ** 2 + across[None, :] ** 2
+        spectrum = np.fft.fft2(self._random.standard_normal(self._shape))
         pattern = np.fft.ifft2(spectrum * square * np.exp(-square)).real
         pattern *= self._settings.caustics / math.sqrt(len(_PATTERN_VELOCITIES)) / pattern.std()
         return np.tile(pattern, (2, 2)).astype(np.float32)
@@ -209,10 +229,12 @@ class Tail(NamedTuple):
 class SimulatedCamera:
     """Camera that takes its frames from the fin angle over time."""
 
-    def __init__(self, settings: SimulatedCameraSettings, size: int) -> None:
-        """size: height and width of a frame [px]"""
+    def __init__(
+        self, settings: SimulatedCameraSettings, width: int, height: int | None = None
+    ) -> None:
+        """width, height: size of a picture [px]; without a height, it is a square"""
         self._settings = settings
-        self._painter = TailPainter(settings, size)
+        self._painter = TailPainter(settings, width, height)
         self._random = np.random.default_rng([settings.seed, 1])
         self._phase = float(self._random.uniform())
         """Phase of the frames relative to time zero, in periods."""

@@ -106,9 +106,9 @@ class Requests:
                 raise Refused("unknown-op", f"no such op '{text.quoted(request.op)}'; {hint}")
             if request.args:
                 raise Refused("bad-arguments", f"{request.op} takes no arguments")
+            return protocol.success(request.id, self.operations[request.op]())
         except Refused as error:
             return protocol.failure(protocol.request_id(payload), error)
-        return protocol.success(request.id, self.operations[request.op]())
 
 
 def _receive(

@@ -9,6 +9,7 @@ from fishd.client import Fish
 from fishd.core import text
 from fishd.core.camera_frames import Frame, FrameHead, Pixels
 from fishd.core.errors import FishError
+from fishd.core.tail_reading import RecordedTail
 
 CAMERA_TIMEOUT_S = 2.0
 """Time without a frame after which the camera counts as lost [s]."""
@@ -16,12 +17,14 @@ POLL_INTERVAL_S = 0.02
 """Interval at which the last frames of a recording are awaited [s]."""
 LAST_FRAMES_TIMEOUT_S = 1.0
 """Longest wait for the last frames of a recording [s]."""
+_SHARED_FIELDS = {*RecordedTail.__struct_fields__} - {"t"}
+"""Names of the fields that a fin angle has in a recording as in its message."""
 _MAX_WAITING_FRAMES = 1000
 """Maximum number of frames that wait for the first tick; older ones are dropped."""
 
 
 class CameraTap:
-    """A camera whose frames are recorded; its errors never end the recording."""
+    """A camera whose frames and fin angles are recorded; its errors never end the recording."""
 
     def __init__(self, address: str | None, endpoint: str | None) -> None:
         """
@@ -32,7 +35,7 @@ class CameraTap:
         """
         self._fish = Fish(endpoint)
         try:
-            self._client = CameraClient(address, fish=self._fish)
+            self._client = CameraClient(address, fish=self._fish, tail=True)
         except BaseException:
             self._fish.close()
             raise
@@ -55,6 +58,10 @@ class CameraTap:
         """Disconnect; may be called twice."""
         self._client.close()
         self._fish.close()
+
+    def refuse_unmeasured(self) -> None:
+        """Raise `Refused` where the camera does not measure the fin angle."""
+        self._client.state.refuse_unmeasured()
 
     def set_time(self, t: float, monotonic: float) -> None:
         """Set the clock offset from the times of a tick: unix, and on fishd's clock [s]."""
@@ -83,6 +90,18 @@ class CameraTap:
             return news, []
         waiting, self._waiting = self._waiting, []
         return news, [(self._head(*pair), pair[1].pixels) for pair in waiting]
+
+    def take_tails(self) -> list[RecordedTail]:
+        """Return the fin angles since the previous call; none before the first tick."""
+        if self._ahead is None:
+            return []
+        return [
+            RecordedTail(
+                t=tail.time + self._ahead,
+                **{name: getattr(tail, name) for name in _SHARED_FIELDS},
+            )
+            for tail in self._client.take_tails()
+        ]
 
     def count_missing(self) -> int | None:
         """Return how many published frames have not arrived; None if the camera does not say.

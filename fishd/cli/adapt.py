@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 import msgspec
 
-from fishd.cli.experiment import ChosenFish, Resumable, Run, experiment_options
+from fishd.cli.experiment import MEASURED_TAIL, ChosenFish, Resumable, Run, experiment_options
 from fishd.cli.options import FiniteRange, seed_option
 from fishd.cli.output import echo
 
@@ -42,6 +42,7 @@ DEFAULT_STEPS = 6400
         is_flag=True,
         help="Live: leave the fish at rest at the end. [default: swim the chosen gait]",
     ),
+    tail=MEASURED_TAIL,
     plot="command, fin, force and thrust of each gait",
     keeps_simulations=True,
 )

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from fishd.cli.completion import complete_contestant
 from fishd.cli.controller_arguments import ControllersCommand
-from fishd.cli.experiment import Resumable, Run, experiment_options
+from fishd.cli.experiment import MEASURED_TAIL, Resumable, Run, experiment_options
 from fishd.cli.options import camera_config_option, for_option
 from fishd.cli.output import echo, echo_table
 from fishd.config import Config, check_tethered
@@ -75,6 +75,7 @@ class _CompareCommand(ControllersCommand, Resumable):
         help="For policies that see pictures, on a remote robot: address at which its fishd "
         "reaches this program. [default: any free port of this machine]",
     ),
+    tail=MEASURED_TAIL,
     plot="command, fin, force and result of each",
 )
 def compare(
@@ -289,6 +290,8 @@ def _are_exact(standings: "list[Standing]") -> bool:
 def _make_table(standings: "list[Standing]", unit: str) -> "Table":
     from rich.table import Table
 
+    from fishd.lab.error_budget import format_fin_angle
+
     if _are_exact(standings):
         no_errors: dict[str, Any] = dict.fromkeys(
             ("thrust_ci95", "total_ci95", "thrust_per_watt_ci95", "thrust_per_watt_total_ci95")
@@ -302,9 +305,11 @@ def _make_table(standings: "list[Standing]", unit: str) -> "Table":
     metered = all(standing.thrust_per_watt is not None for standing in standings)
     costs = ["W", f"m{unit}/W"] if metered else []
     parts = [] if simulated else ["statistical", "calibration"]
-    for head in (*heads, f"m{unit}", *parts, *costs, "Hz", "|φ_c|/Φ", "square"):
+    fins = [format_fin_angle(standing, unit="") for standing in standings]
+    fin_heads = ["fin mrad"] if any(fins) else []
+    for head in (*heads, f"m{unit}", *parts, *costs, *fin_heads, "Hz", "|φ_c|/Φ", "square"):
         table.add_column(head, justify="right", no_wrap=True)
-    for standing in standings:
+    for standing, fin in zip(standings, fins, strict=True):
         cells = [f"{standing.relative_thrust:.1%}"] if has_best else []
         table.add_row(
             standing.contestant,
@@ -312,6 +317,7 @@ def _make_table(standings: "list[Standing]", unit: str) -> "Table":
             text.format_measured(standing.thrust, standing.known_ci95),
             *([] if simulated else _error_cells(standing)),
             *(_power_cells(standing) if metered else []),
+            *([fin or "–"] if any(fins) else []),
             f"{standing.frequency:.3f}" if standing.frequency else "–",
             f"{standing.fullness:.3f}",
             f"{standing.form_factor:.3f}",

@@ -31,6 +31,7 @@ from fishd.cli.options import (
     endpoint_option,
     json_option,
     plot_option,
+    tail_option,
     take_option,
     verb_lease,
 )
@@ -46,6 +47,9 @@ from fishd.core.signals import Event, Tick
 if TYPE_CHECKING:
     from fishd.lab.experiment import Experiment
     from fishd.lab.session import Session
+
+MEASURED_TAIL = "Live: measure the largest fin angle, too."
+"""Help of `--tail` of a verb that measures thrust."""
 
 
 class ChosenFish(NamedTuple):
@@ -148,6 +152,7 @@ class Run:
         *,
         as_json: bool,
         keeps_simulations: bool,
+        uses_tail: bool = False,
     ) -> None:
         """Raises `UsageError`, and `FishdError` for a picture that cannot be drawn."""
         from fishd.lab import drawing
@@ -167,6 +172,8 @@ class Run:
         self.has_folder = bool(resume or folder)
         """Whether the folder is on the command line."""
         self.ending = Ending()
+        self.uses_tail = uses_tail
+        """Whether the fin angles of a camera are used."""
         self._keeps = keeps_simulations or fish.on == "live" or self.has_folder
         self._command = kept_arguments(context)
         self._stack = ExitStack()
@@ -192,7 +199,22 @@ class Run:
             self._session = self._open_session(**piloted)
         return self._session
 
+    def refuse_simulated_tail(self) -> None:
+        """Raise `UsageError` where fin angles are to be measured of a fish without a camera."""
+        self.fish.refuse_other({}, {"--tail": self.uses_tail})
+
     def _open_session(self, **piloted: Any) -> "Session":
+        session = self._open_fish(**piloted)
+        if self.uses_tail and self.fish.on == "live":
+            from fishd.camera.tap import CameraTap
+            from fishd.lab.fin_angle import FinAngles
+
+            camera = self._stack.enter_context(CameraTap(None, self.fish.endpoint))
+            camera.refuse_unmeasured()
+            session.fin_angles = FinAngles(camera, lambda line: echo(f"fishctl: {line}", err=True))
+        return session
+
+    def _open_fish(self, **piloted: Any) -> "Session":
         from fishd.lab.session import LiveSession, VirtualSession
 
         if self.fish.on == "simulation":
@@ -273,12 +295,17 @@ class Run:
         logged: False for a verb that resumes an interrupted swim, not only the following ones
         """
         from fishd.lab.swim_log import SwimLog
+        from fishd.recording.folder import list_recordings
 
         self.echo()
         session, experiment, began = self._session, self._experiment, False
         with self.ending.measuring(), ExitStack() as stack:
             if session:
                 stack.enter_context(session)
+            if session and session.fin_angles:
+                if self.is_resumed:
+                    session.fin_angles.read(list_recordings(self.folder))
+                stack.enter_context(session.heard_by(session.fin_angles))
             if session and experiment and recorded:
                 path, note = experiment.recording(self.kind), f"fishctl {self.kind}"
                 writer = stack.enter_context(session.recorded(path, note))
@@ -336,6 +363,7 @@ class Run:
 def experiment_options(
     *others: Callable[[Any], Any],
     plot: str | None = None,
+    tail: str = "",
     keeps_simulations: bool = False,
     live_config: bool = False,
 ) -> Callable[[F], F]:
@@ -343,6 +371,7 @@ def experiment_options(
 
     others: options of the verb itself, in the order of its help
     plot: what its picture shows; None for a verb without one, which has no `--plot`
+    tail: what `--tail` does; empty for a verb without it
     keeps_simulations: whether a simulation has a folder by default, with a picture
     live_config: whether `--config` and `--set` apply to a live fish, too
     """
@@ -359,6 +388,7 @@ def experiment_options(
             resume: Path | None,
             as_json: bool,
             picture: Path | None = None,
+            uses_tail: bool = False,
             **values: Any,
         ) -> Any:
             if on is None and resume:
@@ -371,8 +401,16 @@ def experiment_options(
                 )
             fish = ChosenFish(on, file, overrides, endpoint)
             with Run(
-                fish, folder, resume, picture, as_json=as_json, keeps_simulations=keeps_simulations
+                fish,
+                folder,
+                resume,
+                picture,
+                as_json=as_json,
+                keeps_simulations=keeps_simulations,
+                uses_tail=uses_tail,
             ) as run:
+                if uses_tail and not live_config:
+                    run.refuse_simulated_tail()
                 return function(*args, run=run, **values)
 
         scope = "" if live_config else "In simulation: "
@@ -381,6 +419,7 @@ def experiment_options(
         for option in (
             json_option,
             *([plot_option(plot)] if plot else []),
+            *([tail_option(tail)] if tail else []),
             take_option,
             endpoint_option,
             set_option,

@@ -16,6 +16,7 @@ from fishd.cli.recording.files import open_recording
 from fishd.config import Config, ServoSettings, adopt, check_tethered, load
 from fishd.core import files
 from fishd.core.errors import FishdError
+from fishd.recording.folder import list_recordings
 from fishd.recording.reader import open_run
 
 if TYPE_CHECKING:
@@ -56,6 +57,15 @@ DEFAULT_EXPERIMENT_S = 180.0
         help="Write the sections plant and simulation of a configuration into this file.",
     ),
     click.option("--force", is_flag=True, help="Overwrite FILE."),
+    click.option(
+        "--tail-scale",
+        type=FiniteRange(min=0.0, max=0.5),
+        metavar="FRACTION",
+        default=0.01,
+        show_default=True,
+        help="With --tail: half-width of the 95 % interval of the scale of fin angles.",
+    ),
+    tail="Use fin angles that a camera measures, for K, λ, K_y and K_d each for itself.",
     plot="forces, fit and residual",
     live_config=True,
 )
@@ -67,6 +77,7 @@ def identify(
     fix: str | None,
     target: Path | None,
     force: bool,
+    tail_scale: float,
     run: Run,
 ) -> None:
     """Identify a fish and its rig from F_x, F_y and φ_c, with 95 % intervals.
@@ -82,6 +93,8 @@ def identify(
     for option, is_given in (("--for", seconds is not None), ("--folder", run.has_folder)):
         if is_given and not experiment:
             raise click.UsageError(f"{option} goes with --experiment")
+    if experiment and run.uses_tail:
+        run.refuse_simulated_tail()
     if target and target.exists() and not force:
         raise FishdError(f"{target}: exists already; --force overwrites it, --to names another")
 
@@ -100,7 +113,13 @@ def identify(
         origin = ", ".join(table.path.name for table in tables)
     with show_waiting("fitting the model to the forces"):
         identification = lab.identify(
-            tables, start=config.plant, rig=config.simulation, fit=names, fix=fixed, servo=servo
+            tables,
+            start=config.plant,
+            rig=config.simulation,
+            fit=names,
+            fix=fixed,
+            servo=servo,
+            tail_scale=tail_scale if run.uses_tail else None,
         )
     result = identification.to_builtins() | {"origin": origin}
     run.show(
@@ -128,7 +147,6 @@ def _swim_experiment(run: Run, seconds: float) -> "tuple[Config, list[Any], Serv
     Return the start configuration of the fit, the tables of ticks and the settings of the servo.
     """
     from fishd.lab.identification import continue_experiment
-    from fishd.recording.folder import list_recordings
 
     session, fish = run.session(), run.fish
     if fish.on == "simulation":
@@ -142,9 +160,12 @@ def _swim_experiment(run: Run, seconds: float) -> "tuple[Config, list[Any], Serv
     before: list[Any] = []
     if run.is_resumed and fish.on == "live":
         before = [open_run(path).frame() for path in list_recordings(run.folder)]
+    tables: list[Any]
     with run.swimming(seconds, since=sum(map(len, before)) * session.tick, logged=False):
         tables = continue_experiment(session, before, seconds)
     run.check("before the fit")
+    if run.uses_tail:  # only recordings have each fin angle
+        tables = [open_run(path) for path in list_recordings(run.folder)]
     return config, tables, session.servo
 
 
@@ -163,10 +184,14 @@ def _print_result(identification: "Identification", origin: str) -> None:
 
     echo(identification.headline)
     echo()
-    ratio = identification["lateral_inertia_ratio"].value
+    ratio, fin_angle = identification["lateral_inertia_ratio"].value, identification.fin_angle
     fitted = [
         estimate
-        for estimate in (*identification.estimates, *identification.products)
+        for estimate in (
+            *identification.estimates,
+            *(fin_angle.estimates if fin_angle else ()),
+            *identification.products,
+        )
         if estimate.fitted
     ]
     rows = [("", "value", "95 % interval", "unit", f"if K_y/K = {ratio:g}")]
@@ -187,6 +212,11 @@ def _print_result(identification: "Identification", origin: str) -> None:
     for channel, symbol in zip(identification.channels, ("F_x", "F_y"), strict=True):
         noise, drift = channel.noise * 1e3, 0.5 * channel.drift * 1e3
         echo(f"{symbol}: noise {noise:.2f} mN, drift ±{drift:.1f} mN")
+    if fin_angle:
+        echo(
+            f"fin angle: noise {fin_angle.noise * 1e3:.2f} mrad, in {fin_angle.used} pictures"
+            + (f", without {fin_angle.left_out} others" if fin_angle.left_out else "")
+        )
     parts = (
         ""
         if identification.passages == 1

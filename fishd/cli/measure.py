@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fishd.cli.experiment import ResumableGroup, Run, experiment_options
+from fishd.cli.experiment import MEASURED_TAIL, ResumableGroup, Run, experiment_options
 from fishd.cli.options import FiniteRange, for_option
 from fishd.cli.output import echo, format_controller
 from fishd.core.console import format_power
@@ -21,6 +21,7 @@ measure_options = experiment_options(
         show_default=True,
         help="Time until the fin swims steadily, and until it is at rest [s].",
     ),
+    tail=MEASURED_TAIL,
     plot="raw force, fitted drift and corrected thrust",
 )
 
@@ -66,7 +67,7 @@ def _measure(
 
 def _print_result(result: "Summary", run: Run) -> None:
     from fishd.lab.disturbances import spell
-    from fishd.lab.error_budget import format_per_watt, format_thrust
+    from fishd.lab.error_budget import format_fin_angle, format_per_watt, format_thrust
 
     clauses = [
         f"{format_controller(result.controller, result.parameters)}: thrust "
@@ -77,6 +78,8 @@ def _print_result(result: "Summary", run: Run) -> None:
         clauses.append(
             f"{format_power(result.power)}, {format_per_watt(result, result.force_unit)}"
         )
+    if fin_angle := format_fin_angle(result):
+        clauses.append(f"largest fin angle {fin_angle}")
     if disturbances := spell(result.disturbances, result.force_unit):
         clauses.append(f"accounted for: {disturbances}")
     if result.remark:

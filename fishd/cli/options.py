@@ -84,6 +84,16 @@ def plot_option(about: str) -> Callable[[F], F]:
     )
 
 
+def tail_option(about: str) -> Callable[[F], F]:
+    """Return the option `--tail`; about: what it does with the fin angles of a camera."""
+    return click.option(
+        "--tail",
+        "uses_tail",
+        is_flag=True,
+        help=f"{about} The camera is that of $FISHD_CAMERA, else that of this machine.",
+    )
+
+
 def seed_option(what: str, default: int | None = 0) -> Callable[[F], F]:
     """Return the option `--seed`; what: what the random numbers are for."""
     return click.option(

@@ -9,7 +9,7 @@ import msgspec
 from msgspec.structs import replace
 
 from fishd.cli.controller_arguments import ValuesType
-from fishd.cli.experiment import ChosenFish, ResumableGroup, Run, experiment_options
+from fishd.cli.experiment import MEASURED_TAIL, ChosenFish, ResumableGroup, Run, experiment_options
 from fishd.cli.options import FiniteRange, for_option
 from fishd.cli.output import echo, format_count, format_ratio, format_speed, warn_of_fin
 from fishd.config import Config
@@ -59,6 +59,7 @@ sweep_options = experiment_options(
         help="In simulation: let the workers of a Dask cluster swim; address of its scheduler, "
         "or its file NAME.json. --resume without it swims on this machine.",
     ),
+    tail=MEASURED_TAIL,
     plot="the curves",
     keeps_simulations=True,
 )
@@ -296,6 +297,9 @@ def _format_result(result: "PointResult", quantity: "Quantity") -> str:
     value = text.format_measured(result.value, result.value_ci95, quantity.unit)
     if quantity.name == "speed":
         value = format_speed(result.value, result.value_ci95, getattr(result, "grid_error", None))
+    if (fin_angle := getattr(result, "fin_angle_max", None)) is not None:
+        ci95 = getattr(result, "fin_angle_max_ci95", None)
+        steady += f", largest fin angle {text.format_measured(fin_angle, ci95, 'rad')}"
     return f"{value}{beats}{steady}"
 
 

@@ -7,7 +7,8 @@ import signal
 import sys
 import time
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
+from typing import TYPE_CHECKING
 
 import click
 
@@ -18,6 +19,9 @@ from fishd.client import AsyncFish
 from fishd.core import text
 from fishd.core.console import status_line
 
+if TYPE_CHECKING:
+    from fishd.camera.tail_watch import TailWatch
+
 REDRAW_INTERVAL_S = 0.1
 """Shortest time from one drawing to the next [s]; a drawing shows all ticks since the last."""
 
@@ -25,7 +29,15 @@ REDRAW_INTERVAL_S = 0.1
 @click.command()
 @daemon_options
 @for_option("End by itself after this time [s]; by default Ctrl-C ends it.")
-def watch(endpoint: str | None, as_json: bool, seconds: float | None) -> None:
+@click.option(
+    "--camera",
+    is_flag=False,
+    flag_value="",
+    metavar="[ADDRESS]",
+    help="Show the fin angle that a camera measures, too: that with the request address ADDRESS, "
+    "else $FISHD_CAMERA, else that of this machine.",
+)
+def watch(endpoint: str | None, as_json: bool, seconds: float | None, camera: str | None) -> None:
     """Watch force, command and timing live, until Ctrl-C.
 
     'late' is the largest delay of a tick in the last 5 s, 'compute' the longest computing time.
@@ -36,18 +48,26 @@ def watch(endpoint: str | None, as_json: bool, seconds: float | None) -> None:
     can_draw = sys.stdout.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
     show = _print_ticks if as_json else _draw if can_draw else _print_lines
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # it too must restore the terminal
-    with suppress(KeyboardInterrupt, TimeoutError):
-        asyncio.run(_run(show, endpoint, seconds))
+    with suppress(KeyboardInterrupt, TimeoutError), ExitStack() as stack:
+        tail = None
+        if camera is not None:
+            from fishd.cli.camera.options import watch_tail
+
+            tail = stack.enter_context(watch_tail(camera or None, endpoint))
+        asyncio.run(_run(show, endpoint, seconds, tail))
 
 
 async def _run(
-    show: Callable[[AsyncFish], Awaitable[None]], endpoint: str | None, seconds: float | None
+    show: Callable[[AsyncFish, "TailWatch | None"], Awaitable[None]],
+    endpoint: str | None,
+    seconds: float | None,
+    tail: "TailWatch | None",
 ) -> None:
     async with asyncio.timeout(seconds), AsyncFish(endpoint) as fish:
-        await show(fish)
+        await show(fish, tail)
 
 
-async def _print_ticks(fish: AsyncFish) -> None:
+async def _print_ticks(fish: AsyncFish, _: "TailWatch | None") -> None:
     seq = 0
     async for tick in fish.ticks():
         if 0 < seq < tick.seq - 1:
@@ -57,22 +77,22 @@ async def _print_ticks(fish: AsyncFish) -> None:
         print_json_line(tick)
 
 
-async def _print_lines(fish: AsyncFish) -> None:
+async def _print_lines(fish: AsyncFish, tail: "TailWatch | None") -> None:
     while True:
         status = await fish.status()
         pairs = format_quantities(status.quantities, status.quantity_units)
         quantities = "".join(f"  {name} {value}" for name, value in pairs)
         echo(
             f"{format_time_of_day(status.t)}  {text.quoted(status.name)}  "
-            f"{status_line(status)}{quantities}"
+            f"{status_line(status)}{quantities}{f'  {tail.describe()}' if tail else ''}"
         )
         await asyncio.sleep(1.0)
 
 
-async def _draw(fish: AsyncFish) -> None:
+async def _draw(fish: AsyncFish, tail: "TailWatch | None") -> None:
     from fishd.cli.watch_screen import View
 
-    view = View(await fish.status())
+    view = View(await fish.status(), tail)
     events = asyncio.create_task(view.collect(fish.events()))
     drawn = -math.inf
     try:

@@ -3,7 +3,7 @@
 import math
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from msgspec import UNSET
@@ -17,6 +17,9 @@ from fishd.core import text
 from fishd.core.console import format_readings, format_thrust
 from fishd.core.robots import find_kind
 from fishd.core.signals import Event, Status, Tick
+
+if TYPE_CHECKING:
+    from fishd.camera.tail_watch import TailWatch
 
 TRACE_SPAN_S = 5.0
 """Time that the traces show [s]."""
@@ -49,8 +52,10 @@ _DOTS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
 class View:
     """Content of the screen; it adapts to the size of the screen each time it is drawn."""
 
-    def __init__(self, status: Status) -> None:
+    def __init__(self, status: Status, tail: "TailWatch | None" = None) -> None:
+        """tail: fin angles of a camera; None leaves them out"""
         self.status = status
+        self._tail = tail
         self._ticks: deque[Tick] = deque()
         self._events: deque[Event] = deque(maxlen=3)
         self._lost = 0
@@ -150,18 +155,19 @@ class View:
         }
 
     def _value_lines(self) -> list[Text]:
-        """Return the readings in a line, and the quantities of the controller in another one."""
+        """Return a line each of readings, of the controller's quantities, and of the camera."""
         now = self._ticks[-1].quantities
         quantities = now if isinstance(now, dict) else {}
         lines = (
             format_readings(self.status),
             format_quantities(quantities, self.status.quantity_units),
         )
-        return [
+        shown = [
             _cut_line(*(part for entry in line for part in _style_entry(*entry)))
             for line in lines
             if line
         ]
+        return [*shown, _cut_line(self._tail.describe())] if self._tail else shown
 
     def _draw_trace(self, trace: Trace, width: int, rows: int) -> Text:
         """Return a trace with its name and scale to the left; lost ticks leave a gap."""

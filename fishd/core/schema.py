@@ -140,6 +140,7 @@ _KINDS: dict[type[inspect.Type], str] = {
     inspect.StructType: "section",
     inspect.DictType: "section",
     inspect.VarTupleType: "list",
+    inspect.TupleType: "list",
 }
 
 

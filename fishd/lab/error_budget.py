@@ -54,6 +54,10 @@ class Thrust(Struct, frozen=True, kw_only=True):
     """Half-width of the 95 % interval of `thrust_per_watt` due to the calibration [N/W]."""
     thrust_per_watt_total_ci95: float | None = None
     """Half-width of the 95 % interval of `thrust_per_watt`, calibration included [N/W]."""
+    fin_angle_max: float | None = None
+    """Mean over beats of the largest fin angle, as a camera measured it [rad]; null without one."""
+    fin_angle_max_ci95: float | None = None
+    """Half-width of the 95 % interval of `fin_angle_max`, from the spread of beats [rad]."""
 
     @property
     def known_ci95(self) -> float | None:
@@ -175,6 +179,13 @@ def _format_with_budget(
     )
 
 
+def format_fin_angle(measured: Thrust, unit: str = "rad") -> str:
+    """Return the largest fin angle with its error; empty where it was not measured."""
+    if measured.fin_angle_max is None:
+        return ""
+    return text.format_measured(measured.fin_angle_max, measured.fin_angle_max_ci95, unit)
+
+
 def warn_of_unknown_calibration(measured: Thrust, unit: str) -> str | None:
     """Return a remark on a calibration of unknown uncertainty; None where it is known."""
     if measured.calibration_ci95 is not None:
@@ -219,7 +230,7 @@ def lateral_force(ticks: Iterable[Tick]) -> float:
     """Return the mean F_y that swimming adds [N]; 0 without a whole beat and a rest."""
     ticks = list(ticks)
     swimming = [tick.fy for swim in _steady_swims(ticks, SWIM_SETTLE_TIME_S) for tick in swim]
-    rests = _settled_phases(ticks, SWIM_SETTLE_TIME_S, swims=False)
+    rests = settled_phases(ticks, SWIM_SETTLE_TIME_S, swims=False)
     resting = [tick.fy for rest in rests for tick in rest]
     if not swimming or not resting:
         return 0.0
@@ -229,7 +240,7 @@ def lateral_force(ticks: Iterable[Tick]) -> float:
 def _steady_swims(ticks: Iterable[Tick], settle: float) -> list[list[Tick]]:
     """Return the ticks of the whole beats of each steady swim."""
     beats = []
-    for swim in _settled_phases(ticks, settle, swims=True):
+    for swim in settled_phases(ticks, settle, swims=True):
         ups = upward_reversals(tick.phi_c for tick in swim)
         if len(ups) > 1:
             # The force of a tick is the mean over the period before it; its angle applies after it.
@@ -237,7 +248,7 @@ def _steady_swims(ticks: Iterable[Tick], settle: float) -> list[list[Tick]]:
     return beats
 
 
-def _settled_phases(ticks: Iterable[Tick], settle: float, *, swims: bool) -> Iterator[list[Tick]]:
+def settled_phases(ticks: Iterable[Tick], settle: float, *, swims: bool) -> Iterator[list[Tick]]:
     """Yield the ticks of each settled swim or rest, without suspect forces."""
     for running, group in groupby(ticks, lambda tick: tick.mode == "running"):
         phase = list(group)

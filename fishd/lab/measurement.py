@@ -145,6 +145,8 @@ def measure(
         lateral=lateral,
         rotation=rotation,
     )
+    if session.fin_angles and measurement.frequency:  # noise of a resting fin is not a beat
+        fields |= session.fin_angles.find_maximum(ticks, settle)
     return replace(
         measurement,
         **fields,

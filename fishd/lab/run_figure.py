@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
+    from fishd.lab.run_traces import Array
+
 MAX_LABELLED_EVENTS = 12
 """Largest number of events that have a text; with more, all events are lines only."""
 COLOURS = {"mark": PURPLE, "fault": ORANGE, "fallback": ORANGE}
@@ -50,8 +52,13 @@ def draw_run(traces: Traces, path: str | os.PathLike[str]) -> None:
         for axis in axes:
             _events(axis, traces, named=axis is axes[0])
         if traces.portrait:
-            portrait, amplitude, density, beat = figure.add_subfigure(grid[1]).subplots(4, 1)
+            count = 4 if traces.fin is None else 5
+            portrait, amplitude, density, beat, *loop = figure.add_subfigure(grid[1]).subplots(
+                count, 1
+            )
             _portrait(portrait, traces, traces.portrait)
+            if traces.fin is not None:
+                _loop(loop[0], traces.phi_c, traces.fin.at_ticks, traces.portrait)
             _spectrum(amplitude, density, traces, traces.portrait)
             _mean_beat(beat, traces, traces.portrait)
 
@@ -79,6 +86,13 @@ def _command(axis: "Axes", traces: Traces) -> None:
     if traces.alpha is not None:
         axis.plot(traces.time, traces.alpha, color=GREEN, linewidth=0.9, label="true fin angle α")
     angles = [traces.phi_c] if traces.alpha is None else [traces.phi_c, traces.alpha]
+    if fin := traces.fin:
+        angles.append(fin.alpha)
+        axis.plot(fin.time, fin.alpha, color=BLUE, linewidth=0.9, label="measured fin angle")
+        maxima = [(beat.time, beat.alpha_max) for beat in fin.beats]
+        axis.plot(
+            *np.array(maxima).reshape(-1, 2).T, ".", color=ORANGE, label="its maximum per beat"
+        )
     axis.set_ylim(*limits(MIN_ANGLE_SPAN, *angles))
     axis.set_ylabel("angle (rad)")
     _legend(axis)
@@ -147,6 +161,17 @@ def _portrait(axis: "Axes", traces: Traces, samples: slice) -> None:
     axis.axvline(0.0, color="0.85", linewidth=0.6)
     axis.plot(x[samples], y[samples], color=GREEN, linewidth=0.7, marker=".")
     axis.set_title(f"phase portrait, last {PORTRAIT_S:g} s")
+
+
+def _loop(axis: "Axes", phi_c: "Array", fin_angle: "Array", samples: slice) -> None:
+    # An instruction angle holds until the next tick.
+    axis.plot(
+        phi_c[samples], fin_angle[samples],
+        drawstyle="steps-pre", color=BLUE, linewidth=0.7, marker=".",
+    )  # fmt: skip
+    axis.set_xlabel("command $φ_c$ (rad)")
+    axis.set_ylabel("measured fin angle (rad)")
+    axis.set_title("fin angle over command")
 
 
 def _spectrum(amplitude: "Axes", density: "Axes", traces: Traces, samples: slice) -> None:

@@ -11,12 +11,14 @@ from msgspec import UNSET
 from numpy.typing import NDArray
 from scipy.signal import periodogram
 
+from fishd.camera.tail.beats import Beat, find_maxima
 from fishd.controllers import registry
 from fishd.core import text
 from fishd.core.errors import RecordingError, UnknownController
 from fishd.core.schema import format_values
 from fishd.core.signals import Tick
 from fishd.recording import Run
+from fishd.recording.fin_angle import MAX_GAP_S, interpolate
 
 PORTRAIT_S = 20.0
 """Length of the phase portrait, at the end of the latest swim [s]."""
@@ -51,6 +53,19 @@ class EventLabel(NamedTuple):
     """Name of the controller with parameters, changed parameters, or text of a mark."""
 
 
+class FinAngle(NamedTuple):
+    """Fin angle that a camera has measured."""
+
+    time: Array
+    """Times of the pictures, since the first tick of the recording [s]."""
+    alpha: Array
+    """Fin angle in the pictures, with NaN where it is unknown and in gaps [rad]."""
+    at_ticks: Array
+    """Fin angle at each time of the ticks [rad]."""
+    beats: list[Beat]
+    """Whole beats, with the largest fin angle of each."""
+
+
 class Traces(NamedTuple):
     """A part of a recording; NaN where ticks are missing, and where a quantity is unknown."""
 
@@ -81,6 +96,8 @@ class Traces(NamedTuple):
     portrait: slice | None
     """Samples of the phase portrait; None where no controller swam."""
     events: list[EventLabel]
+    fin: FinAngle | None = None
+    """Measured fin angle; None without a camera that measured it."""
 
     @property
     def force_time(self) -> Array:
@@ -141,6 +158,28 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
         },
         portrait=_portrait(time, swims),
         events=events[:MAX_EVENTS],
+        fin=_fin_angle(run, rows, time) if run.tails else None,
+    )
+
+
+def _fin_angle(run: Run, rows: tuple[Tick | None, ...], time: Array) -> FinAngle:
+    """Return the measured fin angle within the times of these ticks.
+
+    rows: ticks, and None at breaks; time: their times since the first tick of the recording [s]
+    """
+    clock = np.array([math.nan if row is None else row.time for row in rows])
+    known = np.isfinite(clock)
+    tails = [tail for tail in run.tails if clock[known][0] <= tail.time <= clock[known][-1]]
+    table = np.array([(t.time, math.nan if t.alpha is None else t.alpha) for t in tails])
+    seen, alpha = table.reshape(-1, 2).T
+    gaps = np.flatnonzero(np.diff(seen) > MAX_GAP_S) + 1
+    at_ticks, _ = interpolate(tails, clock)
+    elapsed = np.interp(seen, clock[known], time[known])
+    return FinAngle(
+        np.insert(elapsed, gaps, elapsed[gaps]),
+        _checked(run, "fin_angle", np.insert(alpha, gaps, math.nan)),
+        _checked(run, "fin_angle", at_ticks),
+        find_maxima(elapsed.tolist(), alpha.tolist()),
     )
 
 

@@ -30,6 +30,7 @@ from fishd.core.signals import Event, Publisher, Reason, Tick
 from fishd.lab.simulation import VirtualRun
 
 if TYPE_CHECKING:
+    from fishd.lab.fin_angle import FinAngles
     from fishd.recording.provenance import Source
     from fishd.recording.writer import RunWriter
 
@@ -104,6 +105,8 @@ class Session(ABC):
     """Source of the ticks, as a recording names it."""
     config: dict[str, Any]
     """Configuration of its loop, as plain data."""
+    fin_angles: "FinAngles | None" = None
+    """Fin angles of a camera, which are recorded, too; None without one."""
 
     def __init__(self) -> None:
         self._listeners: list[Publisher] = []
@@ -216,7 +219,7 @@ class Session(ABC):
 
         with RunWriter(os.fspath(path), source=self.source, note=note, extra=extra) as writer:
             self.describe(writer)
-            with self.heard_by(_Flushing(writer)):
+            with self.heard_by(_Flushing(writer, self.fin_angles)):
                 yield writer
 
     def _publish(self, message: Tick | Event) -> None:
@@ -231,14 +234,16 @@ class Session(ABC):
 
 
 class _Flushing:
-    """Publisher that writes ticks and events into a recording, and flushes it."""
+    """Publisher that writes ticks, events and fin angles into a recording, and flushes it."""
 
-    def __init__(self, writer: "RunWriter") -> None:
-        self._writer = writer
+    def __init__(self, writer: "RunWriter", fin_angles: "FinAngles | None") -> None:
+        self._writer, self._fin_angles = writer, fin_angles
         self._flushed = time.monotonic()
 
     def tick(self, tick: Tick) -> None:
         self._writer.tick(tick)
+        for tail in self._fin_angles.take_new() if self._fin_angles else ():
+            self._writer.tail(tail)
         now = time.monotonic()
         if now - self._flushed >= FLUSH_INTERVAL_S:
             self._flushed = now

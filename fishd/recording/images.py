@@ -19,7 +19,7 @@ from fishd.core.decoding import decoder
 from fishd.core.errors import MissingPackage, RecordingError
 from fishd.core.schema import fields_of, note
 
-IMAGE_TOPIC = "camera"
+IMAGE_TOPIC, TAIL_TOPIC = "camera", "tail"
 IMAGE_SCHEMA = "foxglove.CompressedImage"
 _TYPES = {"number": "number", "integer": "integer", "text": "string", "boolean": "boolean"}
 """JSON types of fields. Viewers do not support null: unknown values are omitted in a message."""

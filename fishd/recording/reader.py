@@ -31,7 +31,15 @@ from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError, RecordingError
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
-from fishd.recording.images import IMAGE_TOPIC, RecordedFrame, decode_frame, decode_head
+from fishd.core.tail_reading import RecordedTail
+from fishd.recording.fin_angle import interpolate
+from fishd.recording.images import (
+    IMAGE_TOPIC,
+    TAIL_TOPIC,
+    RecordedFrame,
+    decode_frame,
+    decode_head,
+)
 from fishd.recording.mcap_file import Appended, Damaged, read_records
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX
 from fishd.recording.provenance import FORMAT
@@ -48,12 +56,13 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+_decode_tail: Callable[[bytes], RecordedTail] = decoder(RecordedTail)
 _decode_units: Callable[[bytes], dict[str, str]] = decoder(dict[str, str])
 
-TOPICS = dict(enumerate((*CHANNELS, IMAGE_TOPIC), start=1))
+TOPICS = dict(enumerate((*CHANNELS, IMAGE_TOPIC, TAIL_TOPIC), start=1))
 """Topics by the channel numbers of `RunWriter`, for a file whose channel records are damaged."""
 
-COUNTED_TOPICS = {"tick": "tick", "event": "event", IMAGE_TOPIC: "frame"}
+COUNTED_TOPICS = {"tick": "tick", "event": "event", IMAGE_TOPIC: "frame", TAIL_TOPIC: "fin angle"}
 """Topics whose messages are counted when a recording ends, and the word for a message."""
 
 RECOVERED = "recovered: "
@@ -128,6 +137,8 @@ class Run:
         """All messages of fishd, in the order of arrival, each once."""
         self.frame_heads: list[FrameHead] = []
         """Metadata of the frames of a camera, in the order of arrival."""
+        self.tails: list[RecordedTail] = []
+        """Fin angles that a camera has measured, in the order of arrival."""
         self._scan()
 
     @property
@@ -332,7 +343,7 @@ class Run:
     def _held(self) -> Counter[str]:
         """Number of messages in the file by topic, the repeated ones included."""
         held = Counter(entry.topic for entry in self.entries)
-        held[IMAGE_TOPIC] = len(self.frame_heads)
+        held[IMAGE_TOPIC], held[TAIL_TOPIC] = len(self.frame_heads), len(self.tails)
         return held + self._repeated
 
     @property
@@ -357,6 +368,8 @@ class Run:
             tally.add(message, time)
         for head in self.frame_heads:
             tally.frame(head)
+        for _ in self.tails:
+            tally.tail()
         return tally
 
     def frames(self) -> Iterator[RecordedFrame]:
@@ -399,7 +412,8 @@ class Run:
     def frame(self) -> "DataFrame":
         """Return the ticks as a table: see `ticks_to_frame`; raise `RecordingError`.
 
-        The additional column `elapsed` is the time since the first tick, as in `times` [s].
+        The additional column `elapsed` is the time since the first tick, as in `times` [s]. With
+        fin angles of a camera, `fin_angle` and `fin_angle_uncertainty` are theirs at the ticks.
         """
         names: set[str] = set()
         for tick in self.ticks:
@@ -409,7 +423,11 @@ class Run:
                     f"{self.path}: its controllers have more than {MAX_COLUMNS} quantities, too "
                     "many for a table"
                 )
-        return ticks_to_frame(self.ticks).assign(elapsed=self.times_of("tick"))
+        table = ticks_to_frame(self.ticks).assign(elapsed=self.times_of("tick"))
+        if self.tails:
+            times = [tick.time for tick in self.ticks]
+            table["fin_angle"], table["fin_angle_uncertainty"] = interpolate(self.tails, times)
+        return table
 
     def _scan(self) -> None:
         ticks = 0
@@ -417,7 +435,9 @@ class Run:
             self.finished = isinstance(record, Footer)
             if isinstance(record, Message):
                 if topic == IMAGE_TOPIC:
-                    self._take_frame(record.data)
+                    self.frame_heads.append(self._decode_seen(topic, decode_head, record.data))
+                elif topic == TAIL_TOPIC:
+                    self.tails.append(self._decode_seen(topic, _decode_tail, record.data))
                 elif topic in CHANNELS:
                     self.entries.append(Entry(topic, record.data, record.log_time))
                     ticks += topic == "tick"
@@ -451,12 +471,12 @@ class Run:
         self.is_damaged = True
         self.damage_reason = self.damage_reason or reason
 
-    def _take_frame(self, payload: bytes) -> None:
+    def _decode_seen(self, topic: str, decode: Callable[[bytes], T], payload: bytes) -> T:
         try:
-            self.frame_heads.append(decode_head(payload))
+            return decode(payload)
         except msgspec.DecodeError as error:
             raise RecordingError(
-                f"{self.path}: a frame of the camera cannot be read: {error}"
+                f"{self.path}: a {COUNTED_TOPICS[topic]} of the camera cannot be read: {error}"
             ) from None
 
     def _take_metadata(self, name: str, data: dict[str, str]) -> None:
@@ -507,7 +527,9 @@ def read(path: str | os.PathLike[str]) -> "DataFrame":
 
 def count_messages(end: Summary) -> Counter[str]:
     """Return the number of messages by topic in the summary at the end of a recording."""
-    return Counter({"tick": end.ticks, "event": end.events, IMAGE_TOPIC: end.frames})
+    return Counter(
+        {"tick": end.ticks, "event": end.events, IMAGE_TOPIC: end.frames, TAIL_TOPIC: end.tails}
+    )
 
 
 def find_repaired_problem(reason: str) -> str:

@@ -15,6 +15,7 @@ from fishd.core.camera_frames import FrameHead, Pixels
 from fishd.core.errors import FishError, NoDaemon, RecordingError, Refused
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Status
+from fishd.core.tail_reading import RecordedTail
 from fishd.recording.summary import TickHead
 from fishd.recording.writer import CHANNELS, RunWriter
 
@@ -64,6 +65,9 @@ class FrameSource(Protocol):
 
     def take(self) -> tuple[list[str], list[tuple[FrameHead, Pixels]]]:
         """Return a line for the user per change of the camera's state, and the new frames."""
+
+    def take_tails(self) -> list[RecordedTail]:
+        """Return the fin angles since the previous call."""
 
     def count_missing(self) -> int | None:
         """Return how many published frames have not arrived; None if the camera does not say."""
@@ -292,6 +296,8 @@ class Recorder:
         for head, pixels in frames:
             if lost := self.writer.frame(head, pixels):
                 self._lose(f"just before frame {head.seq}, frames were lost: {lost}")
+        for tail in camera.take_tails():
+            self.writer.tail(tail)
 
     def _close(self) -> None:
         if self._telemetry:

@@ -7,7 +7,8 @@ from mcap.writer import CompressionType, Writer
 
 from fishd.core.errors import RecordingError
 from fishd.core.schema import json_schema, schema_name
-from fishd.recording.images import IMAGE_SCHEMA, image_json_schema
+from fishd.core.tail_reading import RecordedTail
+from fishd.recording.images import IMAGE_SCHEMA, TAIL_TOPIC, image_json_schema
 from fishd.recording.part_file import (
     PART_SUFFIX,
     SUFFIX,
@@ -87,8 +88,9 @@ def _copy(run: Run, file: PartFile) -> None:
     def channel_of(number: int) -> int:
         if number not in channels:  # the record of the channel is damaged
             topic = TOPICS[number]
-            if topic in CHANNELS:
-                name, schema = schema_name(CHANNELS[topic]), json_schema(CHANNELS[topic])
+            kind = RecordedTail if topic == TAIL_TOPIC else CHANNELS.get(topic)
+            if kind:
+                name, schema = schema_name(kind), json_schema(kind)
             else:
                 name, schema = IMAGE_SCHEMA, image_json_schema()
             schema_id = writer.register_schema(name, "jsonschema", schema)

@@ -10,6 +10,7 @@ from fishd.core.camera_frames import FrameHead
 from fishd.core.decoding import decoder
 from fishd.core.robots import find_kind
 from fishd.core.signals import Event, Status, Tick
+from fishd.core.tail_reading import RecordedTail
 from fishd.recording.axis import Axis, ClockStep, ClockSteps
 
 
@@ -65,6 +66,8 @@ class Summary(Struct):
     """Number of places with missing frames, or with a restart of the camera."""
     lost_frames: int = 0
     """Known number of missing frames: not delivered by the camera, or lost on the way."""
+    tails: int = 0
+    """Number of fin angles that a camera has measured."""
     clock_steps: tuple[ClockStep, ...] = ()
     """Steps of the unix clock of fishd's machine."""
 
@@ -86,7 +89,7 @@ class TickHead(Struct, frozen=True, gc=False):
     busy_time_us: float = 0.0
 
 
-Message: TypeAlias = TickHead | Tick | Event | Status | FrameHead
+Message: TypeAlias = TickHead | Tick | Event | Status | FrameHead | RecordedTail
 
 
 def times_of(message: Message) -> tuple[float, float]:
@@ -96,7 +99,7 @@ def times_of(message: Message) -> tuple[float, float]:
 
 def place(axis: Axis, message: Message, arrival: float | None = None) -> float:
     """Return the time of a message as `Axis.place` does."""
-    seq = None if isinstance(message, Event | Status | FrameHead) else message.seq
+    seq = message.seq if isinstance(message, TickHead | Tick) else None
     return axis.place(*times_of(message), seq, arrival)
 
 
@@ -216,6 +219,10 @@ class Tally:
         lost = max(0, frame.seq - last.seq - 1) + max(0, frame.dropped_frames - last.dropped_frames)
         self.lose_frames(lost)
         return lost
+
+    def tail(self) -> None:
+        """Add a fin angle."""
+        self._counts.tails += 1
 
     def lose_frames(self, count: int) -> None:
         """Count frames that were published after the latest one that was added."""

@@ -23,10 +23,12 @@ from fishd.core.errors import RecordingError
 from fishd.core.protocol import Calibrations
 from fishd.core.schema import Reading, json_schema, schema_name
 from fishd.core.signals import Event, Status, Tick
+from fishd.core.tail_reading import RecordedTail
 from fishd.recording.axis import Axis
 from fishd.recording.images import (
     IMAGE_SCHEMA,
     IMAGE_TOPIC,
+    TAIL_TOPIC,
     encode_frame,
     image_json_schema,
 )
@@ -190,12 +192,15 @@ class RunWriter:
         Raise `MissingPackage` without OpenCV (extra: camera).
         """
         payload = encode_frame(head, pixels)
-        self._register_channels({})
-        if IMAGE_TOPIC not in self._channels:
-            schema = self._writer.register_schema(IMAGE_SCHEMA, "jsonschema", image_json_schema())
-            self._channels[IMAGE_TOPIC] = self._writer.register_channel(IMAGE_TOPIC, "json", schema)
+        self._register_camera()
         self._add(IMAGE_TOPIC, head, payload)
         return self.tally.frame(head)
+
+    def tail(self, tail: RecordedTail) -> None:
+        """Record a fin angle that a camera has measured."""
+        self._register_camera()
+        self._add(TAIL_TOPIC, tail, self._encode(tail))
+        self.tally.tail()
 
     def message(self, topic: str, payload: bytes) -> TickHead | Event | Status:
         """Record the bytes of a message of telemetry, and return its content.
@@ -256,6 +261,18 @@ class RunWriter:
                 json_schema(message, readings if message is Tick else None),
             )
             self._channels[topic] = self._writer.register_channel(topic, "json", schema)
+
+    def _register_camera(self) -> None:
+        """Register the topics of a camera, unless they are: with the numbers that readers know."""
+        self._register_channels({})
+        if IMAGE_TOPIC in self._channels:
+            return
+        for topic, name, schema in (
+            (IMAGE_TOPIC, IMAGE_SCHEMA, image_json_schema()),
+            (TAIL_TOPIC, schema_name(RecordedTail), json_schema(RecordedTail)),
+        ):
+            number = self._writer.register_schema(name, "jsonschema", schema)
+            self._channels[topic] = self._writer.register_channel(topic, "json", number)
 
     def _note_stored(self) -> None:
         self._stored, self.stored_seq = self.tally.summary, self.tally.seq

@@ -20,7 +20,13 @@ from fishd.core.camera_frames import StackSettings
 from fishd.core.protocol import State
 from fishd.lab.compare import compare
 
-CAMERA = ("picture.size=32", "simulated.latency=0.01")
+CAMERA = (
+    "picture.size=32",
+    "simulated.latency=0.01",
+    "simulated.width=32",
+    "simulated.height=32",
+)
+"""Settings of a camera whose pictures are those of a comparison."""
 LINE = re.compile(r" +([\d.]+) s +([\d.]+) Hz  thrust +(-?[\d.]+) mN  \|φ_c\| +(\d+)% of Φ")
 
 

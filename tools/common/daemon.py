@@ -121,11 +121,11 @@ class Fishd(Process):
 
     def memory(self, field: str = "VmRSS") -> float:
         """Return a size of the main process in /proc/PID/status [MB]."""
-        return _size(Path(f"/proc/{self.pid}/status"), field)
+        return read_size(Path(f"/proc/{self.pid}/status"), field)
 
     def total_memory(self) -> float:
         """Return the memory of fishd and its gateway, shared pages counted once (PSS) [MB]."""
-        return sum(_size(Path(f"/proc/{pid}/smaps_rollup"), "Pss") for pid in self.processes())
+        return sum(read_size(Path(f"/proc/{pid}/smaps_rollup"), "Pss") for pid in self.processes())
 
 
 @contextlib.contextmanager
@@ -163,7 +163,7 @@ def _cpu_seconds(of: Path) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def _size(file: Path, field: str) -> float:
+def read_size(file: Path, field: str) -> float:
     """Return a size [MB]; 0 after the end of the process."""
     try:
         lines = file.read_text(encoding="utf-8").splitlines()

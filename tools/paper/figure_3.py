@@ -1,12 +1,22 @@
 """Figure 3, A to C: thrust, frequency and fin amplitude of the optimum against Φ."""
 
+from collections.abc import Iterator
+from itertools import pairwise
+
 import numpy as np
 
 from common.report import DOCS
+from fishd.camera.simulated import SimulatedCamera, SimulatedCameraSettings, Tail
+from fishd.camera.tail.beats import average, find_maxima
+from fishd.camera.tail.learner import Learner
+from fishd.camera.tail.meter import TailMeter
 from fishd.config import Config
+from fishd.core.camera_frames import Frame
+from fishd.core.signals import Tick
 from fishd.lab import drawing
 from fishd.lab.drawing import BLACK, BLUE, GREY, ORANGE, YELLOW
 from fishd.lab.optimum import best_square_waves, fast_servo, saturation_amplitude, slow_servo
+from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import Report
 from paper.runs import FOLDER, PLANT, Row, Run, column, read, swim_all, write
 
@@ -22,6 +32,9 @@ BY_SIGHT = (0.1, 0.2, 0.31, 0.42, 0.63, 0.8, 1.0, 1.4)
 BEST, FAST, SLOW = "best square wave", "fast servo", "slow servo"
 LOOP, SWING, LEARNT = "square wave in the loop", "swing in the loop", "learned, in the loop"
 SEEN = "learned from pictures, in the loop"
+FILMED = (0.2, 0.31, 0.42, 0.8, 1.4)
+"""Amplitudes of the square waves whose fin angle a simulated camera measures."""
+MEASURED = "square wave, fin angle measured by a simulated camera"
 
 
 def policy(amplitude: float) -> str:
@@ -61,6 +74,9 @@ def compute(jobs: int) -> None:
     )
     for k in range(0, len(squares), len(NEAR)):
         rows.append(_of(LOOP, max(squares[k : k + len(NEAR)], key=lambda r: r.mean_thrust)))
+    for row in [row for row in rows if row["source"] == LOOP and row["amplitude_rad"] in FILMED]:
+        fin = measure_fin(float(row["amplitude_rad"]), float(row["frequency_Hz"]))
+        rows.append(dict.fromkeys(row, "") | row | {"source": MEASURED, "fin_amplitude_rad": fin})
     swings = swim_all((run("swing", {"C": 0.6}, amplitude) for amplitude in AMPLITUDES), jobs)
     rows += [_of(SWING, report) for report in swings]
     learned = swim_all((run("ppo", {"policy": policy(a)}, a) for a in LEARNED), jobs)
@@ -68,6 +84,30 @@ def compute(jobs: int) -> None:
     seen = swim_all((run("ppo", {"policy": sighted_policy(a)}, a) for a in BY_SIGHT), jobs)
     rows += [_of(SEEN, report) for report in seen]
     write(NAME, rows)
+
+
+def measure_fin(amplitude: float, frequency: float) -> float:
+    """Return the mean of the largest fin angles of a square wave [rad].
+
+    A simulated camera measures them. It learns the tail from a rest and a swim, and measures it in
+    the next swim.
+    """
+    camera, learner = SimulatedCamera(SimulatedCameraSettings(rate=30.0), 640, 480), Learner()
+
+    def film(ticks: list[Tick]) -> Iterator[Frame]:
+        for before, after in pairwise(Tail(t.time, t.alpha, t.alpha_rate) for t in ticks):
+            yield from camera.frames(before, after)
+
+    with VirtualSession(Config(amplitude_limit=amplitude)) as fish:
+        swim = "square", {"frequency": frequency}, 10.0
+        for frame in film(fish.rest(3.0) + fish.swim(*swim)):
+            learner.add(frame.time, frame.pixels)
+        meter = TailMeter(learner.finish())
+        readings = [meter.read(frame.time, frame.pixels) for frame in film(fish.swim(*swim))]
+    beats = find_maxima([r.time for r in readings], [r.alpha for r in readings])
+    mean = average(beats[2:])  # steady by then
+    assert mean
+    return mean[0]
 
 
 def _of(source: str, report: Report) -> Row:
@@ -126,6 +166,10 @@ def draw() -> None:
                 axes.plot(
                     column(rows, "amplitude_rad"), column(rows, name), ls="", label=source, **style
                 )
+            if name == "fin_amplitude_rad":
+                rows = read(NAME, source=MEASURED)
+                angles, fins = column(rows, "amplitude_rad"), column(rows, name)
+                axes.plot(angles, fins, "+", color=BLACK, ms=11, label=MEASURED)
             axes.set_xscale("log")
             axes.set_yscale("log")
             axes.set_xlim(RANGE[0], 1.7)

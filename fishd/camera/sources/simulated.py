@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import msgspec
 import zmq
 from msgspec import UNSET, Struct, UnsetType
+from msgspec.structs import replace
 
 from fishd.camera.clock_offset import ClockOffset, clock_reader
 from fishd.camera.settings import SimulatedSettings
@@ -113,9 +114,9 @@ class SimulatedSource:
     """Source of the frames above the fish of a fishd, also after fishd restarts."""
 
     def __init__(self, settings: SimulatedSettings, size: int) -> None:
-        """size: height and width of a picture [px]"""
-        self._settings = settings
-        self._size = size
+        """size: height and width of a frame, of whose pixels is `off_axis` [px]"""
+        scale = min(settings.width, settings.height) / size
+        self._settings = replace(settings, off_axis=settings.off_axis * scale)
         self._decode: Callable[[bytes], TickTruth] = decoder(TickTruth)
         where = settings.fishd or find_control_address()
         self.device = f"a simulated camera above the fish at {where}"
@@ -137,7 +138,7 @@ class SimulatedSource:
         """Draw the fish of one fishd, until that ends or is replaced."""
         status = fish.status()
         description = _read_description(fish.config())
-        view = _View(self._settings, self._size, description, sink)
+        view = _View(self._settings, description, sink)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         try:
             connect = partial(connect_subscriber, context, access=fish.access)
@@ -185,10 +186,10 @@ class _View:
     """View of the fish of one fishd, which puts each frame at its time."""
 
     def __init__(
-        self, settings: SimulatedSettings, size: int, description: FishDescription, sink: Sink
+        self, settings: SimulatedSettings, description: FishDescription, sink: Sink
     ) -> None:
         self._settings = settings
-        self._camera = SimulatedCamera(settings, size)
+        self._camera = SimulatedCamera(settings, settings.width, settings.height)
         self._prediction = MotionPrediction(description)
         self._description = description
         self._sink = sink

@@ -8,6 +8,7 @@ VERBS = {
     "Look": {
         "status": Verb("camera.look", "status", "Show the state of the camera."),
         "view": Verb("camera.look", "view", "Show its picture in the terminal, or write a PNG."),
+        "measure": Verb("camera.measure", "measure", "Show the fin angle, or learn the tail."),
         "page": Verb("camera.page", "page", "Show its picture live on a web page."),
     },
     "Set up": {

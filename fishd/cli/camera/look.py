@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from fishd.camera.client import CameraClient
     from fishd.camera.drawing import Colours
     from fishd.camera.messages import CameraState
+    from fishd.core.tail_reading import TailReading
 
 ANSWER_TIMEOUT_S = 2.0
 """Longest wait for an answer [s]."""
@@ -69,6 +70,8 @@ def status_rows(state: "CameraState") -> list[tuple[str, str]]:
     picture_size = f"{state.picture_width} x {state.picture_height} px"
     source = f", of pictures of {picture_size}" if state.picture_width else ""
     pairs.append(("frames", f"{state.width} x {state.height} px{source}"))
+    if state.tail != "off":
+        pairs.append(("fin angle", _describe_tail(state)))
     lost = []
     if state.dropped_frames:
         lost.append(f"{format_count(state.dropped_frames, 'frame')} that no client got")
@@ -84,6 +87,18 @@ def status_rows(state: "CameraState") -> list[tuple[str, str]]:
     pairs.append(("process", f"fishd-camera {state.version}, pid {state.pid}, up {uptime}"))
     pairs.append(("published", state.frames))
     return pairs
+
+
+def _describe_tail(state: "CameraState") -> str:
+    """Return what the camera does about the fin angle, and why it does no more."""
+    if state.tail_problem:
+        return f"{state.tail}: {state.tail_problem}"
+    if state.tail == "measuring":
+        measured = format_count(state.measured_pictures, "picture")
+        left_out = state.unmeasured_pictures
+        return f"measured in {measured}" + (f", no time for {left_out} more" if left_out else "")
+    learn = "not learned: fishctl camera measure --learn"
+    return learn if state.tail == "unlearned" else state.tail
 
 
 @click.command()
@@ -222,8 +237,13 @@ def _read_for(client: "CameraClient", watch: "AxisWatch", seconds: float) -> Non
         watch.find()
 
 
-def draw_picture(client: "CameraClient", watch: "AxisWatch", whole: bool) -> "Colours":
-    """Return the latest picture with the axis; whole: that of the camera, not only the crop."""
+def draw_picture(
+    client: "CameraClient", watch: "AxisWatch", whole: bool, tail: "TailReading | None" = None
+) -> "Colours":
+    """Return the latest picture with the axis, and with the midline of the tail in a whole one.
+
+    whole: that of the camera, not only the crop
+    """
     from fishd.camera import drawing
 
     assert client.latest
@@ -232,7 +252,8 @@ def draw_picture(client: "CameraClient", watch: "AxisWatch", whole: bool) -> "Co
         if client.view is None:
             raise FishdError("the camera sends no views: publish.view_rate of its settings is 0")
         colours, crop = drawing.decode_view(client.view), client.view.header.crop
-        return drawing.draw_axis(colours, watch.axis, len(pixels), crop)
+        drawn = drawing.draw_axis(colours, watch.axis, len(pixels), crop)
+        return drawing.draw_midline(drawn, tail, client.state.picture_width)
     return drawing.draw_axis(drawing.to_colours(pixels), watch.axis, len(pixels))
 
 

@@ -1,8 +1,9 @@
 """Options and helpers of the verbs about a camera: its address, pictures, and the fish."""
 
 import os
+import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,15 +13,18 @@ import yaml
 from fishd.cli.options import verb_lease
 from fishd.cli.output import echo
 from fishd.client import Fish
-from fishd.core.errors import FishdError, NoDaemon
+from fishd.core.errors import FishdError, FishError, NoDaemon
 from fishd.core.process.interruption import raise_on_first_signal
 from fishd.core.signals import Event, Tick
 
 if TYPE_CHECKING:
     from fishd.camera.client import CameraClient
+    from fishd.camera.tail_watch import TailWatch
     from fishd.core.camera_frames import Frame
     from fishd.lab.session import LiveSession
 
+THREAD_TIMEOUT_S = 1.0
+"""Longest wait for the end of a thread [s]."""
 camera_option = click.option(
     "--camera",
     "address",
@@ -103,6 +107,66 @@ def find_fishd(endpoint: str | None, stack: ExitStack) -> Fish | None:
             raise
         return None
     return fish
+
+
+@contextmanager
+def follow_commands(endpoint: str | None, boot_id: str, watch: "TailWatch") -> Iterator[None]:
+    """Add the instruction angles of fishd to `watch`, in a thread.
+
+    boot_id: identifier of the boot from which the camera's clock counts; a fishd with another clock
+        is left out, and so is one that does not answer
+    """
+
+    def follow(stopping: threading.Event) -> None:
+        with suppress(FishError), Fish(endpoint) as fish:
+            if fish.status().boot_id != boot_id:
+                return
+            for tick in fish.ticks():
+                if stopping.is_set():
+                    return
+                watch.add_command(tick.time, tick.phi_c)
+
+    with _in_thread(follow):
+        yield
+
+
+@contextmanager
+def watch_tail(address: str | None, endpoint: str | None) -> Iterator["TailWatch"]:
+    """Yield the fin angles of a camera, which a thread reads; raises `CameraLost` without one.
+
+    endpoint: control socket of the fishd with the instruction angles
+    """
+    from fishd.camera.client import CameraClient
+    from fishd.camera.tail_watch import TailWatch
+
+    watch = TailWatch()
+    with CameraClient(address, tail=True) as client:
+
+        def follow(stopping: threading.Event) -> None:
+            while not stopping.is_set():
+                try:
+                    client.poll(0.1)
+                    client.check()
+                except FishError:
+                    watch.latest = None
+                for tail in client.take_tails():
+                    watch.add(tail)
+
+        with _in_thread(follow), follow_commands(endpoint, client.state.boot_id, watch):
+            yield watch
+
+
+@contextmanager
+def _in_thread(work: Callable[[threading.Event], None]) -> Iterator[None]:
+    """Run a function in a thread; its argument is set when it has to end."""
+    stopping = threading.Event()
+    thread = threading.Thread(target=work, args=(stopping,), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stopping.set()
+        thread.join(THREAD_TIMEOUT_S)
 
 
 def refuse_lockstep(virtual: bool) -> None:

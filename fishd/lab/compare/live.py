@@ -104,6 +104,7 @@ def _standing(label: str, runs: list[ThrustMeasurement], session: Session) -> St
         **thrust_fields(
             session.calibration, thrust, error, rotation=rotation, lateral=lateral, **_power(runs)
         ),
+        **_fin_angle(runs),
     )
 
 
@@ -118,6 +119,16 @@ def _power(runs: list[ThrustMeasurement]) -> dict[str, Any]:
         return {}
     power, per_watt, errors = zip(*complete, strict=True)
     return {"power": sum(power) / len(power), "thrust_per_watt": weighted_mean(per_watt, errors)}
+
+
+def _fin_angle(runs: list[ThrustMeasurement]) -> dict[str, Any]:
+    """Return the fields about the fin angle; none if it is unknown for any run."""
+    pairs = [(run.fin_angle_max, run.fin_angle_max_ci95) for run in runs]
+    known = [(value, ci95) for value, ci95 in pairs if value is not None and ci95]
+    if len(known) < len(runs):
+        return {}
+    value, ci95 = weighted_mean(*zip(*known, strict=True))
+    return {"fin_angle_max": value, "fin_angle_max_ci95": ci95}
 
 
 def _trace(run: ThrustMeasurement) -> Trace:

@@ -38,6 +38,7 @@ from fishd.lab.identification.passages import MIN_PASSAGE_S, Passage, Unidentifi
 from fishd.lab.identification.pulses import place_pulses
 from fishd.lab.identification.result import Identification
 from fishd.lab.identification.summary import MIN_CLEAR_FALL, SCALED, OtherLaw, summarise
+from fishd.lab.identification.tail import add_fin_angles, collect_fin_angles
 from fishd.lab.limits import find_excess
 from fishd.lab.session import Session, refuse_lost
 from fishd.virtual.imperfections import SimulationSettings
@@ -105,6 +106,7 @@ def identify(
     fit: Sequence[str] | None = None,
     fix: Sequence[str] = (),
     servo: ServoSettings | None = None,
+    tail_scale: float | None = None,
 ) -> Identification:
     """Fit a fish and its rig to recorded runs.
 
@@ -120,6 +122,8 @@ def identify(
         λ was measured
     servo: calibrated settings of the servo whose pulses carried the commands of tables; that of a
         recording of a robot is known
+    tail_scale: half-width of the 95 % interval of the scale of measured fin angles, which are used,
+        too, as a fraction; None leaves them out
 
     Raises `Unidentifiable` for runs without usable data, `ParameterError` for a name that cannot
     be fitted, and the errors of `fishd.recording.read`.
@@ -130,7 +134,9 @@ def identify(
     names = check((*DEFAULT, *filter(given_values.get, FURTHER)) if fit is None else fit, fix)
     opened = [_open(run) for run in _to_list(runs)]
     servos = [_servo(run, servo) for run in opened]
-    parts = passages([_to_frame(run) for run in opened], servos)
+    tables = [_to_frame(run) for run in opened]
+    fin = None if tail_scale is None else collect_fin_angles(opened, tables)
+    parts = passages(tables, servos)
     _refuse_unusable(parts)
     values = {name: float(given_values[name]) for name in POSSIBLE}
     scale_is_free = _scale_is_free(names, values)
@@ -154,7 +160,11 @@ def identify(
         parts, settle = (longer, settle) if longer else (parts, _SETTLE_S)
         problem = Problem(parts, problem.names, settle, problem.law)
         values = solve(problem, values)
-    return summarise(parts, problem, values, given_values, scale_is_free, others)
+    if fin is None or tail_scale is None:
+        return summarise(parts, problem, values, given_values, scale_is_free, others)
+    found = summarise(parts, problem, values, given_values, False, others)
+    values = {**given_values, **values}
+    return add_fin_angles(found, problem, values, fin, tail_scale, scale_is_free=scale_is_free)
 
 
 def _place_pulses(

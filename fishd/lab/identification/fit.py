@@ -60,14 +60,14 @@ LOGARITHMIC = frozenset(
 """Parameters fitted as logarithms: they are positive, and their errors are relative."""
 SIGNED = ("servo_reaction", "rotation")
 """Parameters that may be negative."""
-_STEPS = {
+STEPS = {
     "servo_delay": 1e-4,
     "backlash": 2e-4,
     "cable_slack": 2e-4,
     "servo_dead_zone": 2e-4,
     "quadratic_drag": 1e-3,
 }
-"""Steps of finite differences; 1e-4 for parameters that are not listed."""
+"""Steps of finite differences of a motion; 1e-4 for parameters that are not listed."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class Problem:
 
     def changed(self, names: Sequence[str], law: ServoLaw) -> "Problem":
         """Return the problem of the same passages with other parameters and another law."""
-        return Problem([passage for passage, _ in self._passages], names, self._settle, law)
+        return Problem(self.passages, names, self._settle, law)
 
     def to_z(self, values: dict[str, float]) -> Array:
         """Return the vector z of the fitted parameters, clipped to their bounds."""
@@ -136,6 +136,16 @@ class Problem:
         """Return the lower and the upper bounds of z."""
         lowest, highest = ({name: BOUNDS[name][end] for name in self.names} for end in (0, 1))
         return self.to_z(lowest), self.to_z(highest)
+
+    @property
+    def passages(self) -> list[Passage]:
+        """The fitted passages."""
+        return [passage for passage, _ in self._passages]
+
+    @property
+    def settle(self) -> float:
+        """Time at the start of a passage that is left out [s]."""
+        return self._settle
 
     @property
     def skips(self) -> list[int]:
@@ -211,7 +221,7 @@ class Problem:
     ) -> list[Array]:
         """Return the derivative of the residuals by one element of z, by passage."""
         value = values[name]
-        step = step or _STEPS.get(name, 1e-4) * (value if name in LOGARITHMIC else 1.0)
+        step = step or STEPS.get(name, 1e-4) * (value if name in LOGARITHMIC else 1.0)
         if name in FORCES and not (name == "coupling" and values["quadratic_drag"]):
             step = 1e-6 * max(1e-3, abs(value))
         later = {**values, name: value + step}
@@ -224,19 +234,30 @@ class Problem:
 
     def _responses(self, values: dict[str, float], *, keep: bool = True) -> list[Array]:
         """Return the response of the fin for λ = 1 by passage; cache the latest one."""
-        drive = {name: values[name] for name in DRIVE}
-        drive["quadratic_drag"] *= values["coupling"]
+        drive = self._drive(values)
         if self._cached and self._cached[0] == drive:
             return self._cached[1]
-        model = Drive(**drive, servo_law=self.law)
-        responses = [
-            respond(model, passage.angles, passage.timing, near)
-            for (passage, _), near in zip(self._passages, self._latest_motions, strict=True)
-        ]
+        responses = self._respond(drive)
         moved = [forces for forces, _ in responses]
         if keep:
             self._cached, self._latest_motions = (drive, moved), [motion for _, motion in responses]
         return moved
+
+    def motions(self, values: dict[str, float]) -> list[Motion]:
+        """Return the motion of the fin for λ = 1, by passage."""
+        return [motion for _, motion in self._respond(self._drive(values))]
+
+    def _drive(self, values: dict[str, float]) -> dict[str, float]:
+        drive = {name: values[name] for name in DRIVE}
+        drive["quadratic_drag"] *= values["coupling"]
+        return drive
+
+    def _respond(self, drive: dict[str, float]) -> list[tuple[Array, Motion]]:
+        model = Drive(**drive, servo_law=self.law)
+        return [
+            respond(model, passage.angles, passage.timing, near)
+            for (passage, _), near in zip(self._passages, self._latest_motions, strict=True)
+        ]
 
 
 def solve(

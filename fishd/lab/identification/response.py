@@ -68,8 +68,20 @@ class Motion:
     """Wheel angle that drives the fin, at the points and half way between them [rad]."""
     turned: Array
     """Angle of the wheel itself at the same instants [rad]."""
+    alpha: Array
+    """Angle of the fin at the points [rad]."""
     rate: Array
     """Speed of the fin [rad/s]."""
+    begin: float
+    """Point at which the commands of the passage begin, in steps."""
+    step: float
+    """Distance of two points [s]."""
+
+    def fin_angles(self, times: Array) -> Array:
+        """Return the angle of the fin at times since the start of the passage [s], for λ = 1."""
+        cell, fraction = _find_cells(self.begin + times / self.step, self.alpha.size)
+        alpha, rate, later = self.alpha, self.rate, cell + 1
+        return _hermite(alpha[cell], alpha[later], rate[cell], rate[later], fraction, self.step)
 
 
 @dataclass(frozen=True)
@@ -158,9 +170,7 @@ def respond(
     acceleration = _acceleration(drive, alpha, rate, pull[::2])
     # A command acts at a grid point, which is servo_delay after its begin.
     start = slots_before * steps - drive.servo_delay / h
-    position = np.clip(start + timing.samples / h, 0.0, alpha.size - 1.001)
-    cell = position.astype(int)
-    fraction = position - cell
+    cell, fraction = _find_cells(start + timing.samples / h, alpha.size)
     rates, next_rates = rate[cell], rate[cell + 1]
     a = _hermite(alpha[cell], alpha[cell + 1], rates, next_rates, fraction, h)
     v = _hermite(rates, next_rates, acceleration[cell], acceleration[cell + 1], fraction, h)
@@ -173,7 +183,14 @@ def respond(
     mount_rates = np.interp(edges, np.arange(turned.size), _smoothed_speed(turned, 0.5 * h))
     reaction = -np.diff(mount_rates, axis=0) / np.diff(timing.spans, axis=0)
     forces = np.vstack((means[:3], reaction, means[3]))
-    return forces, Motion(servo, pull, turned, rate)
+    return forces, Motion(servo, pull, turned, alpha, rate, start, h)
+
+
+def _find_cells(position: Array, points: int) -> tuple[NDArray[np.int_], Array]:
+    """Return the cell of each position on the grid, and the position in its cell, 0 to 1."""
+    inside = np.clip(position, 0.0, points - 1.001)
+    cell = inside.astype(int)
+    return cell, inside - cell
 
 
 def _smoothed_speed(angles: Array, step: float) -> Array:

@@ -27,6 +27,9 @@ UNITS = {
     "rotation": "rad",
     "offset_x": "N",
     "offset_y": "N",
+    "camera_delay": "s",
+    "fin_angle_zero": "rad",
+    "fin_angle_scale": "1",
 }
 """Units of the estimates, in the order of tables; the names are those of the configuration."""
 PRODUCT_UNITS = {
@@ -97,9 +100,29 @@ class Fit:
     """Offset and drift of the sensor, smoothed, shape (2, n) [N]."""
 
 
+@dataclass(frozen=True)
+class FinAngleFit:
+    """The camera that measured the fin angle, and its agreement with the identified fish."""
+
+    estimates: tuple[Estimate, ...]
+    """Delay of its time stamps, zero and, where K_y/K is known, scale."""
+    explained: float
+    """Share of the variance of the fin angle that the identified fish explains."""
+    noise: float
+    """Rms of the residual [rad]."""
+    used: int
+    """Number of fin angles."""
+    left_out: int
+    """Number of those that were left out, as they deviate too much."""
+
+    def to_builtins(self) -> dict[str, Any]:
+        """Return everything, for JSON."""
+        return vars(self) | {"estimates": {e.name: _to_builtins(e) for e in self.estimates}}
+
+
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """A fish and its rig as identified from forces."""
+    """A fish and its rig as identified from forces, and fin angles if there are any."""
 
     headline: str
     """First line of a report: whether the values can be trusted, and if not, why."""
@@ -132,6 +155,8 @@ class Identification:
     fit: Fit
     servo_law: ServoLaw
     """Law of the servo with which the forces are explained best."""
+    fin_angle: FinAngleFit | None = None
+    """Camera that measured the fin angle; None where only forces are used."""
 
     def __getitem__(self, name: str) -> Estimate:
         """Return the estimate of this name; raises KeyError."""
@@ -206,6 +231,7 @@ class Identification:
             "seconds": self.seconds,
             "passages": self.passages,
             "remarks": list(self.remarks),
+            **({"fin_angle": self.fin_angle.to_builtins()} if self.fin_angle else {}),
         }
 
     def _line(self, name: str, value: float | str) -> str:

@@ -135,7 +135,7 @@ def summarise(
     if not identified:
         half_widths = dict.fromkeys(half_widths, np.inf)
     estimates = [
-        _estimate(name, all_values[name], half_widths) for name in UNITS if name in all_values
+        make_estimate(name, all_values[name], half_widths) for name in UNITS if name in all_values
     ]
     if scale_is_free:
         estimates = [_with_free_scale(each) for each in estimates]
@@ -159,7 +159,7 @@ def summarise(
         + (_assumed_ratio(all_values) if scale_is_free and identified else ""),
         identified=identified,
         estimates=tuple(estimates),
-        products=_products(problem.names, all_values, covariance, identified),
+        products=make_products(problem.names, all_values, covariance, identified),
         channels=(channels[0], channels[1]),
         seconds=sum(passage.duration for passage in parts),
         passages=len(parts),
@@ -232,7 +232,7 @@ def _with_free_scale(estimate: Estimate) -> Estimate:
     )
 
 
-def _products(
+def make_products(
     names: Sequence[str], values: dict[str, float], covariance: Array, identified: bool
 ) -> tuple[Estimate, ...]:
     """Return K λ², K_y λ and K_d λ with their intervals."""
@@ -340,7 +340,8 @@ def _drift_error(residual: Array) -> float:
     return max(halves)
 
 
-def _estimate(name: str, value: float, half_widths: dict[str, float]) -> Estimate:
+def make_estimate(name: str, value: float, half_widths: dict[str, float]) -> Estimate:
+    """Return a parameter with its interval; half_widths: of the fitted ones, as fitted."""
     half_width = half_widths.get(name)
     if half_width is None:
         return Estimate(name, value, value, value, fitted=False)

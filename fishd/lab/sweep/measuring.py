@@ -156,6 +156,8 @@ def measure_point(point: Point, session: Session, seconds: float) -> Result:
         thrust=measured.thrust,
         thrust_ci95=measured.thrust_ci95,
         beat_frequency=measured.frequency,
+        fin_angle_max=measured.fin_angle_max,
+        fin_angle_max_ci95=measured.fin_angle_max_ci95,
         power=measured.power,
         thrust_per_watt=measured.thrust_per_watt,
         thrust_per_watt_ci95=measured.thrust_per_watt_ci95,

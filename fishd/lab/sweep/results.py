@@ -31,6 +31,10 @@ class Result(Struct, frozen=True):
     """Thrust divided by the thrust of the best square wave; of a simulated fish."""
     fin_amplitude: float | None = None
     """Mean over half beats of the largest fin angle [rad]; of a simulated fish."""
+    fin_angle_max: float | None = None
+    """Mean over beats of the largest fin angle that a camera measured [rad]; None without one."""
+    fin_angle_max_ci95: float | None = None
+    """Half-width of the 95 % confidence interval of `fin_angle_max` [rad]."""
     power: float | None = None
     """Electrical power of the servo [W]; None if unknown."""
     thrust_per_watt: float | None = None

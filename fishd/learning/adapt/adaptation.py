@@ -17,7 +17,7 @@ from fishd.lab.compare.comparison import Standing
 from fishd.lab.compare.contestants import Contestant
 from fishd.lab.compare.figures import draw as draw_gaits
 from fishd.lab.compare.live import LiveComparison
-from fishd.lab.error_budget import format_thrust
+from fishd.lab.error_budget import format_fin_angle, format_thrust
 from fishd.lab.experiment import Experiment, Progress
 from fishd.lab.identification import experiment as swim_excitation
 from fishd.lab.identification.figure import draw as draw_fit
@@ -155,7 +155,11 @@ def adapt(
     for name, reason in left_out.items():
         show.warn(f"fishctl: {name}: left out: {reason}")
     for gait in gaits:
-        done(f"{gait.contestant}: {format_thrust(gait, session.unit)} at {gait.frequency:.3f} Hz")
+        fin = format_fin_angle(gait)
+        done(
+            f"{gait.contestant}: {format_thrust(gait, session.unit)} at {gait.frequency:.3f} Hz"
+            + (f", largest fin angle {fin}" if fin else "")
+        )
     for path in pictures:
         draw_gaits(path, gaits, live.traces(), session.amplitude, session.unit)
     for name, remark in live.remarks():

@@ -81,7 +81,7 @@ def serving(
     stopping = threading.Event()
     endpoint = f"ipc://{folder}/r"
     pairs = (f"publish.requests={endpoint}", f"publish.frames=ipc://{folder}/f")
-    with Server(load(None, pairs), source) as camera_server:
+    with Server(load(None, pairs), source, folder / "tail.bin") as camera_server:
         thread = threading.Thread(target=camera_server.run, args=(stopping.is_set,))
         thread.start()
         try:

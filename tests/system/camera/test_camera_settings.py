@@ -26,7 +26,8 @@ def test_the_good_simulated_camera_is_the_default_and_the_bad_one_the_rig_web() 
     good = yaml.safe_load((ROOT / "config/camera-simulated.yaml").read_text())["simulated"]
     assert set(good) == set(SimulatedSettings.__struct_fields__)
     web = load(ROOT / "config/camera-web.yaml").simulated
-    assert msgspec.structs.asdict(web) == msgspec.structs.asdict(WEB) | {"fishd": None}
+    whole = {"fishd": None, "width": 640, "height": 480}
+    assert msgspec.structs.asdict(web) == msgspec.structs.asdict(WEB) | whole
 
 
 @pytest.mark.parametrize(

@@ -126,8 +126,8 @@ def test_views_are_drawn_for_whoever_wants_them_and_seldom(camera: CameraProcess
         assert time.monotonic() - begun > 0.5  # 5 a second at most
     header = views[-1].header
     picture = simplejpeg.decode_jpeg(views[-1].jpeg, colorspace="GRAY")
-    assert picture.shape[:2] == (header.height, header.width) == (420, 420)
-    assert (header.crop.left, header.crop.width) == (0.0, 1.0)
+    assert picture.shape[:2] == (header.height, header.width) == (360, 480)
+    assert (header.crop.left, header.crop.width) == (0.125, 0.75)
     with camera.client() as client:
         client.poll(1.0)
         assert client.view is None

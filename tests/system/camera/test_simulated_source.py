@@ -142,7 +142,8 @@ def test_in_lockstep_every_tick_has_its_frames_at_any_speed(tmp_path: Path, rate
 
 
 def test_in_lockstep_a_frame_is_the_same_as_beside_the_simulation(tmp_path: Path) -> None:
-    clean = ("simulated.noise=0", "simulated.rate=null")
+    small = ("simulated.width=84", "simulated.height=84")
+    clean = ("simulated.noise=0", "simulated.rate=null", *small)
     with (
         running(tmp_path, "--set", "lockstep=true") as daemon,
         running_camera(tmp_path, *settings(daemon, *clean)) as camera,

@@ -7,11 +7,14 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from fishd.camera import messages
-from fishd.camera.messages import BadMessage, FrameHeader, PublishedFrame, Until
+from fishd.camera.messages import BadMessage, FrameHeader, PublishedFrame, TailMessage, Until
 from fishd.core.camera_frames import Pixels
 
 PIXELS = np.arange(12, dtype=np.uint8).reshape(3, 4)
 HEADER = FrameHeader(session="s", seq=7, time=1.25, available=1.5, width=4, height=3)
+TAIL = TailMessage(
+    session="s", seq=7, time=1.25, alpha=None, zero=0.01, reason="why", midline=((1.5, 2.0),)
+)
 
 
 @pytest.mark.parametrize(
@@ -25,8 +28,12 @@ def test_it_is_read_back_as_it_was_sent(pixels: Pixels) -> None:
     assert np.array_equal(message.pixels, pixels)
 
 
+def test_a_fin_angle_is_read_back_as_it_was_sent() -> None:
+    assert messages.decode(messages.encode_tail(TAIL)) == TAIL
+
+
 def test_no_topic_begins_like_another() -> None:
-    topics = [messages.FRAME, messages.VIEW, messages.STATE, messages.UNTIL]
+    topics = [messages.FRAME, messages.VIEW, messages.TAIL, messages.STATE, messages.UNTIL]
     assert not [(a, b) for a in topics for b in topics if a != b and a.startswith(b)]
 
 
@@ -43,6 +50,7 @@ def test_no_topic_begins_like_another() -> None:
         (messages.encode_frame(replace(HEADER, available=-1e300), PIXELS), "`$.available`"),
         (messages.encode_frame(replace(HEADER, time=1e6), PIXELS), "999998 s before its exposure"),
         (messages.encode_until(Until(session="s", until=1e300)), "`$.until`"),
+        (messages.encode_tail(replace(TAIL, time=1e300)), "`$.time`"),
     ],
 )
 def test_what_is_no_message_is_refused(parts: list[bytes], why: str) -> None:
@@ -54,7 +62,7 @@ def test_what_is_no_message_is_refused(parts: list[bytes], why: str) -> None:
 
 @given(st.lists(st.binary(max_size=100), min_size=1, max_size=4))
 def test_anything_is_a_message_or_refused(parts: list[bytes]) -> None:
-    for topic in (parts[0], b"frame", b"view", b"state", b"until"):
+    for topic in (parts[0], b"frame", b"view", b"tail", b"state", b"until"):
         with pytest.raises(BadMessage):
             messages.decode([topic, *parts[1:]])
 

@@ -38,9 +38,22 @@ def tip(settings: SimulatedCameraSettings, alpha: float, rate: float = 0.0) -> t
     return centre, float(np.sqrt(dark @ (rows - centre) ** 2 / dark.sum()))
 
 
-def test_the_tip_is_where_the_fin_angle_puts_it() -> None:
+@pytest.mark.parametrize("tilt", [0.0, 0.1])
+@pytest.mark.parametrize("alpha", [-0.3, 0.2])
+def test_the_fin_is_straight_at_the_fin_angle_to_the_axis(alpha: float, tilt: float) -> None:
+    picture = TailPainter(replace(CLEAR, tilt=tilt), 640, 480).paint(alpha, 0.0, 0.0).astype(float)
+    columns = np.arange(340, 490)
+    dark = picture.max() - picture[:, columns]
+    middle = np.arange(480) @ dark / dark.sum(axis=0)
+    slope, _ = line = np.polyfit(columns, middle, 1)
+    assert np.arctan(slope) - tilt == pytest.approx(alpha, abs=1e-3)
+    assert np.abs(middle - np.polyval(line, columns)).max() < 0.1
+
+
+def test_the_skeleton_bends_smoothly_into_the_fin() -> None:
     assert tip(CLEAR, 0.0)[0] == pytest.approx(41.5, abs=0.05)
-    assert tip(CLEAR, 0.2)[0] - 41.5 == pytest.approx(0.74 * 84 * np.tan(0.2), rel=0.05)
+    straight = 0.74 * 84 * np.tan(0.2)  # without a skeleton
+    assert tip(CLEAR, 0.2)[0] - 41.5 == pytest.approx(0.85 * straight, rel=0.05)
 
 
 def test_a_fast_tail_is_smeared_by_a_long_exposure() -> None:
