@@ -122,6 +122,13 @@ class Measuring:
             self._is_finishing = self._learner is not None
             self._changed.notify()
 
+    def cancel_learning(self) -> None:
+        """Forget the collected pictures, and measure on with what was learned before."""
+        with self._changed:
+            self._learner, self._is_finishing = None, False
+            if self.condition == "learning":
+                self.condition = "measuring" if self.learned else "unlearned"
+
     # The rest runs in the thread.
 
     def _run(self) -> None:

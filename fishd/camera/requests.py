@@ -74,6 +74,10 @@ class CameraRequests:
         """Let the camera learn from these pictures; its state says when it has done so."""
         return self._call(CameraState, "finish_tail")
 
+    def cancel_tail(self) -> CameraState:
+        """Let the camera forget these pictures, and measure on as before."""
+        return self._call(CameraState, "cancel_tail")
+
     def _call(self, kind: type[T], op: str, timeout: float | None = None) -> T:
         """Send a request and return its result; raises `CameraLost` and `Refused`."""
         identity = next(self._ids)

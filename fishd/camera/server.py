@@ -78,6 +78,7 @@ class Server:
                 "config": lambda: without_password(self._settings),
                 "learn_tail": self._begin_learning,
                 "finish_tail": self._finish_learning,
+                "cancel_tail": self._cancel_learning,
             }
             stack.enter_context(self._measuring)
             self._stack = stack.pop_all()
@@ -289,6 +290,10 @@ class Server:
 
     def _finish_learning(self) -> CameraState:
         self._measuring.finish_learning()
+        return self._state()
+
+    def _cancel_learning(self) -> CameraState:
+        self._measuring.cancel_learning()
         return self._state()
 
     def _state(self) -> CameraState:

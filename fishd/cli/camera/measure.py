@@ -113,7 +113,11 @@ def _learn(client: "CameraClient", fish: "Fish | None", seconds: float, as_json:
             with open_session(fish, REST_S + seconds) as rig:
                 rig.rest(REST_S)
                 rig.swim("square", {"frequency": SWIM_HZ}, seconds)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, FishdError) as error:
+        with suppress(FishdError):  # a camera that is gone forgets, too
+            client.requests.cancel_tail()
+        if isinstance(error, FishdError):
+            raise
         echo("fishctl: interrupted: nothing is learned", err=True)
         return INTERRUPTED
     state = client.requests.finish_tail()

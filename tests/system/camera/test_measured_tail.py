@@ -212,3 +212,17 @@ def test_a_fish_that_another_client_lets_swim_is_not_disturbed(
         assert "the fish was not seen at rest" in done.stdout
         with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
             assert fish.status().controller == "swing"
+
+
+def test_a_camera_measures_on_when_learning_is_interrupted(
+    daemon: Daemon, camera: CameraProcess
+) -> None:
+    before = camera.until(lambda state: state.tail == "measuring")
+    addresses = ("--endpoint", daemon.endpoint, "--camera", camera.endpoint)
+    with Process(FISHCTL, "camera", "measure", "--learn", *addresses) as process:
+        camera.until(lambda state: state.tail == "learning")
+        status, _, said = process.end(signal.SIGINT)
+    assert status == 130
+    assert "fishctl: interrupted: nothing is learned" in said
+    after = camera.status()
+    assert (after.tail, after.tail_learned) == ("measuring", before.tail_learned)

@@ -168,6 +168,21 @@ def test_what_could_not_be_learned_changes_nothing_and_is_said(
     assert thread.problem.endswith(problem)  # until the tail is learned
 
 
+@pytest.mark.parametrize(("learn", "condition"), [(True, "measuring"), (False, "unlearned")])
+def test_learning_that_is_cancelled_leaves_what_was_learned_before(
+    start: Start, learn: bool, condition: str
+) -> None:
+    thread = start(learn=learn)
+    before = thread.learned
+    thread.begin_learning()
+    thread.offer("s", 1, 0.1, PICTURE)
+    thread.cancel_learning()
+    assert (thread.condition, thread.learned, thread.problem) == (condition, before, "")
+    thread.finish_learning()
+    thread.cancel_learning()
+    assert (thread.condition, thread.learned) == (condition, before)
+
+
 def test_learning_that_nobody_finishes_ends_by_itself(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
