@@ -256,7 +256,7 @@ def swimming() -> Iterator[Claim]:
 def _swimming(fish: str) -> Iterator[Claim]:
     margins = _margins(fish, figure_6.CELL)
     fine = _margins(fish, figure_6.FINE_CELL)
-    text = f"faster than sine and triangle by {_percentages(margins)}"
+    text = f"faster than the next wave by {_percentages(margins)}"
     if fine:
         text += f"; on cells of {figure_6.FINE_CELL} mm by {_percentages(fine)}"
     yield Claim(

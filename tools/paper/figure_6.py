@@ -1,4 +1,4 @@
-"""Figure 6: the speed of free swimmers against frequency, on cells of 0.5 and of 0.25 mm.
+"""Figure 6: the speed of free swimmers against frequency on cells of 0.5 mm, some also on others.
 
 Each swim is stored when it ends, and stored swims are not computed again: `make figures` resumes
 after an interruption. A swim of 18 s takes some two minutes of one core on cells of 0.5 mm, and 12
@@ -48,7 +48,7 @@ class Reading(NamedTuple):
     """C of the swings."""
     waves: tuple[str, ...] = WAVES
     fine: tuple[tuple[str, float], ...] = ()
-    """Controllers and settings that also swim on the finest grid."""
+    """Controllers and settings that also swim on coarser and finer cells."""
     lost: tuple[tuple[str, float], ...] = ()
     """Swims in which the fish turns and leaves the part with small cells before its speed is
     steady."""
@@ -138,8 +138,8 @@ def curves(fish: str) -> list[Case]:
 def cases() -> list[Case]:
     """Return every swim of the table."""
     chosen = [case for fish in READINGS for case in curves(fish)]
-    fine = [(f, swim) for f, reading in READINGS.items() for swim in reading.fine]
-    return chosen + [Case(fish, *swim, FINE_CELL) for fish, swim in fine]
+    refined = [(f, swim) for f, reading in READINGS.items() for swim in reading.fine]
+    return chosen + [Case(f, *swim, cell) for f, swim in refined for cell in STEPS if cell != CELL]
 
 
 def other_starts() -> list[Case]:
