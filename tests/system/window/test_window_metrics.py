@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import signal
 import subprocess
 import urllib.parse
 import urllib.request
@@ -137,7 +138,7 @@ async def test_a_silent_fish_has_no_old_values(own_daemon: Daemon, tmp_path: Pat
             assert re.findall('.*"fish".*', scrape) == ['fishd_up{fish="fish"} 0.0']
 
 
-async def test_a_disk_that_does_not_answer_keeps_no_scrape_waiting(
+async def test_a_disk_that_does_not_answer_keeps_no_scrape_and_no_end_waiting(
     daemon: Daemon, tmp_path: Path
 ) -> None:
     stalled = "import shutil, time; shutil.disk_usage = lambda path: time.sleep(1e6)"
@@ -146,6 +147,7 @@ async def test_a_disk_that_does_not_answer_keeps_no_scrape_waiting(
             for _ in range(2):
                 status, scrape = await read_metrics(browser)
                 assert (status, "disk" in scrape) == (200, False)
+        assert window.end(signal.SIGINT)[0] == 0
 
 
 async def test_from_the_network_a_scrape_needs_a_token_which_opens_nothing_else(
