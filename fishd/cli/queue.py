@@ -2,7 +2,6 @@
 
 import shlex
 import time
-from collections.abc import Callable
 from datetime import datetime, timedelta
 from functools import wraps
 from typing import Any
@@ -13,7 +12,7 @@ from fishd.cli import dry_run
 from fishd.cli.options import F, Utf8Text, daemon_options, take_option, verb_lease
 from fishd.cli.output import echo, echo_table, format_count, print_json
 from fishd.core.errors import FishdError
-from fishd.core.experiment_queue import MAX_ITEMS, MAX_REPEAT, Item, QueueFile, View
+from fishd.core.experiment_queue import MAX_ITEMS, MAX_REPEAT, QueueFile, View
 from fishd.recording.folder import runs_folder
 
 EXPERIMENTS = ("measure", "sweep", "compare", "optimise", "identify", "adapt", "learn")
@@ -41,13 +40,6 @@ def _queue_options(function: F) -> F:
         return function(*args, file=QueueFile(runs_folder(), endpoint), **values)
 
     return daemon_options(open_file)  # type: ignore[return-value]
-
-
-def _number_argument(name: str, metavar: str, largest: int) -> Callable[[F], F]:
-    return click.argument(name, type=click.IntRange(1, largest), metavar=metavar)
-
-
-_item_argument = _number_argument("number", "NUMBER", 2**31)
 
 
 @queue.command(context_settings={"ignore_unknown_options": True})
@@ -80,7 +72,9 @@ def add(
     if as_json:
         print_json(item)
     else:
-        echo(f"experiment {item.id}: {shlex.join(words)}{_format_runs(item)}")
+        each = "" if seconds is None else f", {_format_duration(seconds)} each"
+        runs = format_count(repeat, "run")
+        echo(f"experiment {item.id}: {shlex.join(words)} ({runs}{each})")
 
 
 @queue.command("list")
@@ -90,23 +84,24 @@ def list_items(file: QueueFile, as_json: bool) -> None:
     _show(file, as_json)
 
 
-def _print(view: View) -> None:
+def _show(file: QueueFile, as_json: bool) -> None:
+    view = file.view()
+    if as_json:
+        print_json(view)
+        return
     if view.items:
         from rich.table import Table
 
-        table = Table(box=None, pad_edge=False)
-        for head in ("", "experiment", "runs", "each"):
-            table.add_column(head, overflow="fold")
+        table = Table("", "experiment", "runs", "each", box=None, pad_edge=False)
         for item in view.items:
             state = ", it runs" if item.id == view.current else ", interrupted" if item.run else ""
-            words = f"{shlex.join(item.words)}{state}"
             each = "?" if item.seconds is None else _format_duration(item.seconds)
+            words = f"{shlex.join(item.words)}{state}"
             table.add_row(str(item.id), words, str(item.repeat), each)
         echo_table(table)
     for past in view.past:
-        ended = datetime.fromtimestamp(past.ended).strftime("%Y-%m-%d %H:%M")
         result = f": {past.message}" if past.message else ""
-        echo(f"{ended} {past.run} {past.outcome}{result}")
+        echo(f"{_format_time(past.ended)} {past.run} {past.outcome}{result}")
     echo(f"the queue {_describe(view)}")
 
 
@@ -114,25 +109,16 @@ def _describe(view: View) -> str:
     """Return state, duration and end of a queue in words."""
     if view.state == "empty":
         return "is empty"
-    parts = ["runs" if view.state == "running" else "pauses"]
-    if view.state == "paused":
-        parts[0] += f": {view.reason}" if view.reason else "; start it with 'fishctl queue start'"
+    start = view.reason or "start it with 'fishctl queue start'"
+    parts = ["runs" if view.state == "running" else f"pauses: {start}"]
     at_least = "at least" if view.unknown else "about"
-    parts.append(f"{at_least} {_format_duration(view.left)} in all")
-    if view.ends is not None:
-        parts.append(
-            f"until {_format_time(view.ends)} if it {'goes on' if view.current else 'starts'} now"
-        )
+    end = _format_time(time.time() + view.left)
+    parts.append(f"{at_least} {_format_duration(view.left)}, until {end} from now")
     if view.pauses:
         parts.append("it pauses after this run")
     if view.pause_at is not None:
         parts.append(f"it stops at {_format_time(view.pause_at)}")
     return "; ".join(parts)
-
-
-def _format_runs(item: Item) -> str:
-    each = "" if item.seconds is None else f", {_format_duration(item.seconds)} each"
-    return f" ({format_count(item.repeat, 'run')}{each})"
 
 
 def _format_duration(seconds: float) -> str:
@@ -144,12 +130,12 @@ def _format_duration(seconds: float) -> str:
 def _format_time(t: float) -> str:
     """Return a unix time as local time of day, with the date unless it is today."""
     when = datetime.fromtimestamp(t)
-    return when.strftime("%H:%M" if when.date() == datetime.now().date() else "%Y-%m-%d %H:%M")
+    return f"{when:%H:%M}" if when.date() == datetime.now().date() else f"{when:%Y-%m-%d %H:%M}"
 
 
 @queue.command()
-@_item_argument
-@_number_argument("position", "POSITION", MAX_ITEMS)
+@click.argument("number", type=int)
+@click.argument("position", type=click.IntRange(1, MAX_ITEMS))
 @_queue_options
 def move(number: int, position: int, file: QueueFile, as_json: bool) -> None:
     """Move an experiment to a position, 1 for the first."""
@@ -159,18 +145,7 @@ def move(number: int, position: int, file: QueueFile, as_json: bool) -> None:
 
 
 @queue.command()
-@_item_argument
-@_number_argument("runs", "RUNS", MAX_REPEAT)
-@_queue_options
-def repeat(number: int, runs: int, file: QueueFile, as_json: bool) -> None:
-    """Set how many runs of an experiment are left, the present one included."""
-    with file.changing() as content:
-        content.find(number).repeat = runs
-    _show(file, as_json)
-
-
-@queue.command()
-@_item_argument
+@click.argument("number", type=int)
 @_queue_options
 def remove(number: int, file: QueueFile, as_json: bool) -> None:
     """Remove an experiment that does not run; what it has measured is kept."""
@@ -242,12 +217,3 @@ def start(file: QueueFile, as_json: bool) -> int:
     if as_json:
         print_json(file.view())
     return status
-
-
-def _show(file: QueueFile, as_json: bool) -> None:
-    """Print the queue after a change."""
-    view = file.view()
-    if as_json:
-        print_json(view)
-    else:
-        _print(view)

@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta, Struct
+from msgspec.structs import asdict
 
 from fishd.core import files, text
 from fishd.core.addresses import find_control_address, is_default_address
@@ -127,26 +128,16 @@ class Queue(Struct):
         self.past, self.reason = [], ""
 
 
-class View(Struct):
-    """The queue as it is shown."""
+class View(Queue):
+    """The queue as it is shown; `current` is the item that runs."""
 
-    state: Literal["running", "paused", "empty"]
-    reason: str
-    """Reason why it has paused."""
-    items: list[Item]
-    current: int | None
-    """Identifier of the item that runs."""
-    elapsed: float
-    """Time since that began [s]."""
-    left: float
+    state: Literal["running", "paused", "empty"] = "empty"
+    elapsed: float = 0.0
+    """Time since that item began [s]."""
+    left: float = 0.0
     """Expected time until the end of all items whose duration is known [s]."""
-    unknown: int
+    unknown: int = 0
     """Number of items whose duration is not known."""
-    pauses: bool
-    pause_at: float | None
-    past: list[Past]
-    ends: float | None = None
-    """Unix time at which it ends if it runs, or is started now [s]; None if that is not known."""
 
 
 class _Versioned(Struct):
@@ -238,24 +229,14 @@ class QueueFile:
         if not is_running:
             _forget_killed_runner(queue)
         elapsed = max(0.0, time.time() - queue.began) if queue.current is not None else 0.0
-        left = 0.0
-        for item in queue.items:
-            spent = elapsed if item.id == queue.current else 0.0
-            each = item.seconds or 0.0
-            left += max(0.0, each - spent) + (item.repeat - 1) * each
-        unknown = sum(item.seconds is None for item in queue.items)
+        left = sum((item.seconds or 0.0) * item.repeat for item in queue.items)
+        begun = next((item.seconds or 0.0 for item in queue.items if item.id == queue.current), 0.0)
         return View(
-            "running" if is_running else "paused" if queue.items else "empty",
-            queue.reason,
-            queue.items,
-            queue.current,
-            elapsed,
-            left,
-            unknown,
-            queue.pauses,
-            queue.pause_at,
-            queue.past,
-            time.time() + left if queue.items and not unknown else None,
+            **asdict(queue),
+            state="running" if is_running else "paused" if queue.items else "empty",
+            elapsed=elapsed,
+            left=left - min(elapsed, begun),
+            unknown=sum(item.seconds is None for item in queue.items),
         )
 
 
