@@ -194,11 +194,9 @@ def pause(now: bool, at: float | None, cancel: bool, file: QueueFile, as_json: b
         raise FishdError("the queue does not run")
     with file.changing() as content:
         if cancel:
-            content.pauses, content.pause_at = False, None
-        elif now or at is not None:
-            content.pause_at = time.time() if now else at
+            content.cancel_pause()
         else:
-            content.pauses = True
+            content.pause(time.time() if now else at)
     _show(file, as_json)
 
 

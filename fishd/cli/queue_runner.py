@@ -97,8 +97,8 @@ class QueueRunner:
             return "it was stopped"
         if queue.pause_at is not None and queue.pause_at <= time.time():
             at, queue.pause_at = format_time_of_day(queue.pause_at), None
-            return f"as requested for {at}"
-        return "as requested" if queue.pauses else ""
+            return f"it was to stop at {at}"
+        return "it was to pause after that run" if queue.pauses else ""
 
     def _find_problem(self) -> str:
         """Return why no run can begin now; empty if one can."""

@@ -122,6 +122,17 @@ class Queue(Struct):
             )
         self.items.remove(item)
 
+    def pause(self, at: float | None) -> None:
+        """Pause at a unix time [s], or after the run that goes on."""
+        if at is None:
+            self.pauses = True
+        else:
+            self.pause_at = at
+
+    def cancel_pause(self) -> None:
+        """Pause neither after the run that goes on nor at a time."""
+        self.pauses, self.pause_at = False, None
+
     def clear(self) -> None:
         """Remove all items but the one that runs, and what is known of the past."""
         self.items = [item for item in self.items if item.id == self.current]
