@@ -43,7 +43,7 @@ class QueueError(FishdError):
     """A queue cannot be read or changed."""
 
 
-class Item(Struct):
+class Item(Struct, forbid_unknown_fields=True):
     """An experiment that waits or runs."""
 
     id: int
@@ -59,7 +59,7 @@ class Item(Struct):
     """Name of the folder of the run that has begun, or was interrupted and is resumed."""
 
 
-class Past(Struct):
+class Past(Struct, forbid_unknown_fields=True):
     """A run that has ended."""
 
     words: list[str]
@@ -71,7 +71,7 @@ class Past(Struct):
     """Its result, or the reason why it failed."""
 
 
-class Queue(Struct):
+class Queue(Struct, forbid_unknown_fields=True):
     """Content of the file."""
 
     version: int = VERSION
@@ -235,8 +235,10 @@ class QueueFile:
 
     def view(self) -> View:
         """Return the queue as it is shown; raise `QueueError`."""
+        is_running = self.find_runner() is not None  # first: a runner that ends has written before
         queue = self.read()
-        is_running = self.find_runner() is not None
+        if not is_running and queue.current is not None:
+            is_running = self.find_runner() is not None  # it may have begun since
         if not is_running:
             _forget_killed_runner(queue)
         elapsed = max(0.0, time.time() - queue.began) if queue.current is not None else 0.0

@@ -101,7 +101,7 @@ function Item({ item, place, queue, mayDrive, passed, send }) {
   const what = runs ? `runs, ${duration(elapsed)}${each && ` of about ${each}`}` : `${item.run ? "interrupted, is resumed" : "waits"}${each && `, about ${each} each`}`;
   const button = (text, label, action, isOff) => html`<button type="button" aria-label=${`${label} ${words}`} title=${label}
     disabled=${!mayDrive || isOff} onClick=${action}>${text}</button>`;
-  return html`<li class=${`job ${runs ? "running" : ""}`}>
+  return html`<li class="queued">
     <div class="job-head"><span class="muted">${what}</span><span class="buttons">
       <label class="special">Runs <input class="number" type="number" min="1" max="1000" value=${item.repeat} disabled=${!mayDrive} aria-label=${`Runs of ${words}`}
         onChange=${(event) => event.target.value > 0 && send("repeat", { ...number, repeat: Number(event.target.value) })()} /></label>

@@ -30,6 +30,7 @@ CHANGES = [
     ("/api/fish/fish/drive", {"take": True}),
     ("/api/fish/fish/release", {}),
     ("/api/fish/fish/request", {"op": "set-controller", "args": {"name": "square"}}),
+    ("/api/fish/fish/queue", {"op": "clear"}),
     ("/api/jobs", {"fish": "fish", "kind": "record"}),
     ("/api/jobs/check", {"fish": "fish", "kind": "record"}),
     ("/api/jobs/1/stop", {}),
@@ -93,7 +94,7 @@ async def test_another_site_starts_no_reading_either_where_the_browser_tells(
     async with Browser(window.url) as browser:
         for site in ("cross-site", "same-site"):
             headers = {"Sec-Fetch-Site": site}
-            for path in ("/api/runs", "/metrics"):
+            for path in ("/api/runs", "/api/fish/fish/queue", "/metrics"):
                 refused = await browser.refusal(path, headers=headers)
                 assert refused == (403, "other-origin")
 

@@ -594,6 +594,52 @@ def refuse_barriers(page: Page) -> None:
         assert serious == [], (page.url, page.viewport_size, scheme)
 
 
+def test_a_queue_is_filled_ordered_started_and_stopped_without_a_mouse(
+    new_window: WindowProcess,
+) -> None:
+    with live_page(new_window.url, bypass_csp=True) as (page, complaints):
+        page.evaluate(AXE.read_text(encoding="utf-8"))
+        go(page, "experiments")
+        queue, queued = page.locator(".queue"), page.locator(".queued code")
+        expect(queue).to_contain_text("Empty")
+        for count, seconds in enumerate(("21", "60", "45")):
+            page.get_by_label("Seconds").fill(seconds)
+            page.get_by_role("button", name="Add to queue").press("Enter")
+            expect(queued).to_have_count(count + 1)
+        page.get_by_role("button", name="Move up measure swing --for 45").press("Enter")
+        expect(queued.nth(1)).to_have_text("fishctl measure swing --for 45")
+        runs = page.get_by_label("Runs of measure swing --for 60")
+        runs.fill("3")
+        runs.press("Tab")
+        expect(queue).to_contain_text("3 in it, about 4\N{NO-BREAK SPACE}min")
+        page.get_by_role("button", name="Remove measure swing --for 21").press("Enter")
+        expect(queued).to_have_count(2)
+        page.get_by_label("Stop at").fill("18:00")
+        expect(queue.get_by_role("button", name="Do not pause")).to_be_visible()
+        walk(page)
+        refuse_flaws(page)
+        queue.get_by_role("button", name="Start queue").press("Enter")
+        expect(queue.get_by_role("progressbar")).to_be_visible()
+        expect(page.locator("#mode")).to_have_text("running")
+        refuse_flaws(page)
+        queue.get_by_role("button", name="Stop now").press("Enter")
+        expect(queue).to_contain_text("It pauses: it was to stop at ")
+        expect(queue).to_contain_text("interrupted, is resumed")
+        queue.get_by_text("Latest runs").press("Enter")
+        expect(queue).to_contain_text("interrupted, the fish rests")
+        refuse_flaws(page)
+        expect(page.locator("#mode")).to_have_text("idle")
+        assert complaints == []
+
+
+def refuse_flaws(page: Page) -> None:
+    """Fail if the page has a serious barrier, or is wider than its screen, at any width."""
+    for width in (1280, 800, 390):
+        page.set_viewport_size({"width": width, "height": 844})
+        assert page.evaluate("document.documentElement.scrollWidth") == width
+        refuse_barriers(page)
+
+
 def test_the_files_of_the_page_are_small() -> None:
     folder = resources.files("fishd.window").joinpath("page")
     files = [*folder.iterdir(), *folder.joinpath("vendor").iterdir()]
