@@ -525,7 +525,7 @@ def test_the_keyboard_reaches_everything_and_the_focus_is_visible(window: Window
 def walk(page: Page) -> None:
     """Reach everything that is shown with the Tab key, in reading order, the E-stop first."""
     reachable = page.evaluate("""() => {
-        const kinds = "button, input, select, a[href], [tabindex='0']";
+        const kinds = "button, input, select, summary, a[href], [tabindex='0']";
         const isReachable = (node) => !node.disabled && node.checkVisibility();
         globalThis.wanted = [...document.querySelectorAll(kinds)].filter(isReachable);
         return wanted.length;
@@ -533,16 +533,16 @@ def walk(page: Page) -> None:
     page.keyboard.press("Tab")
     while page.evaluate("document.activeElement.id") != "estop":
         page.keyboard.press("Tab")  # begins where the mouse was last
-    focused = []
-    for _ in range(reachable):
-        focused.append(
-            page.evaluate("""() => {
-                const { outlineStyle, outlineWidth } = getComputedStyle(document.activeElement);
-                if (outlineStyle === "none" || parseFloat(outlineWidth) < 2)
-                    throw new Error(`no focus is seen: ${document.activeElement.id}`);
-                return wanted.indexOf(document.activeElement);
-            }""")
-        )
+    focused: list[int] = []
+    while len(focused) < reachable:
+        place = page.evaluate("""() => {
+            const { outlineStyle, outlineWidth } = getComputedStyle(document.activeElement);
+            if (outlineStyle === "none" || parseFloat(outlineWidth) < 2)
+                throw new Error(`no focus is seen: ${document.activeElement.id}`);
+            return wanted.indexOf(document.activeElement);
+        }""")
+        if place not in focused[-1:]:  # hours and minutes of a time are parts of one input
+            focused.append(place)
         page.keyboard.press("Tab")
     assert focused == list(range(reachable))  # in reading order, and the E-stop first
 
