@@ -29,14 +29,16 @@ class Quantity(NamedTuple):
     factor: float
     """Number by which a value in SI units is multiplied for display."""
 
-    def format(self, value: tuple[float, float | None] | None) -> str:
-        """Return value and half-width as text."""
+    def format(self, value: tuple[float, float | None] | None, force_unit: str = "N") -> str:
+        """Return value and half-width as text, with the unit of a force that is not in newtons."""
         if value is None:
             return "–"
         mean, ci95 = value[0] * self.factor, value[1]
+        own = self.unit.replace("N", text.quoted(force_unit)) if "N" in self.unit else self.unit
+        unit = "" if own == self.unit else f" {own}"
         if ci95 is None:
-            return f"{mean:.4g}" if self.unit == "%" else f"{mean:.4g} ± ?"
-        return text.format_measured(mean / 1e3, ci95 * self.factor / 1e3)
+            return f"{mean:.4g}{unit}" if self.unit == "%" else f"{mean:.4g} ± ?{unit}"
+        return f"{text.format_measured(mean / 1e3, ci95 * self.factor / 1e3)}{unit}"
 
 
 QUANTITIES = {
@@ -76,6 +78,8 @@ class Results(Struct):
     kind: str
     rows: list[Row] = []
     estimates: list[Estimate] = []
+    force_unit: str = "N"
+    """Unit of forces: `N`, or that of a sensor that is not calibrated."""
     summary: str = ""
     """Result other than a number, in words."""
     columns: dict[str, list[float | None]] = {}
@@ -88,7 +92,7 @@ def read_results(path: Path) -> Results:
     """Return the results of a recording, or of the experiment in a folder; raise `FishdError`."""
     if not path.is_dir():
         run = open_run(path)
-        return Results(run.name, "recording", [_measure(run)])
+        return Results(run.name, "recording", [_measure(run)], [], run.summary.force_unit)
     header = read_header(path)
     try:
         results = read_result(path)
@@ -107,6 +111,7 @@ def read_results(path: Path) -> Results:
         header.kind,
         [row for row in rows if row.values],
         estimates,
+        header.force_unit,
         text.line(said[0]) if len(results) == 1 and said[0] else summary,
         {name: values for name, values in columns.items() if any(v is not None for v in values)},
         [row.get("controller", "") for row in table],

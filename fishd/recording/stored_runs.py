@@ -41,7 +41,7 @@ class DeletedRun(Struct):
     name: str
     deleted: float
     """Time of the deletion [s, unix]."""
-    path: Path
+    path: str
 
 
 def find_stored_run(run: str, folder: Path) -> Path:
@@ -103,7 +103,7 @@ def delete_run(path: Path) -> DeletedRun:
         place.rmdir()
         raise
     empty_trash(path.parent, KEPT_DAYS)
-    return DeletedRun(place.name, _name_of(path), _deletion_time(place), place / path.name)
+    return DeletedRun(place.name, _name_of(path), _deletion_time(place), str(place / path.name))
 
 
 def delete_forever(path: Path) -> None:
@@ -123,7 +123,7 @@ def list_trash(folder: Path) -> list[DeletedRun]:
         for path in paths:
             if path not in map(note_path, paths):
                 time_s = _deletion_time(place)
-                deleted.append(DeletedRun(place.name, _name_of(path), time_s, path))
+                deleted.append(DeletedRun(place.name, _name_of(path), time_s, str(path)))
     return deleted
 
 
@@ -132,10 +132,11 @@ def restore_run(deleted_id: str, folder: Path) -> Path:
     for deleted in list_trash(folder):
         if deleted_id in (deleted.id, deleted.name):  # the latest of several of one name
             _refuse_taken(folder, deleted.name, "rename that one first")
-            _move(deleted.path, folder / deleted.path.name)
+            path = Path(deleted.path)
+            _move(path, folder / path.name)
             with suppress(OSError):
-                deleted.path.parent.rmdir()
-            return folder / deleted.path.name
+                path.parent.rmdir()
+            return folder / path.name
     raise RecordingError(f"the trash has no '{text.quoted(deleted_id)}'; see 'fishctl runs trash'")
 
 

@@ -147,7 +147,7 @@ def show(runs: tuple[str, ...], folder: Path | None, as_json: bool) -> None:
     if as_json:
         print_json(results)
         return
-    rows = [(result.name, row) for result in results for row in result.rows]
+    rows = [(result, row) for result in results for row in result.rows]
     names = [name for name in QUANTITIES if any(name in row.values for _, row in rows)]
     table = Table(box=None, pad_edge=False)
     for head in ("run", "controller"):
@@ -155,9 +155,10 @@ def show(runs: tuple[str, ...], folder: Path | None, as_json: bool) -> None:
     for name in names:
         unit = QUANTITIES[name].unit
         table.add_column(f"{name}{f' [{unit}]' if unit else ''}", justify="right", no_wrap=True)
-    for run, row in rows:
-        cells = [QUANTITIES[name].format(row.values.get(name)) for name in names]
-        table.add_row(text.line(run), text.line(row.label), *cells)
+    for result, row in rows:
+        unit = result.force_unit
+        cells = [QUANTITIES[name].format(row.values.get(name), unit) for name in names]
+        table.add_row(text.line(result.name), text.line(row.label), *cells)
     echo_table(table)
     for result in results:
         for estimate in result.estimates:
