@@ -293,13 +293,14 @@ class FishLink:
         encoded, last, messages = self._history
         if time.monotonic() - encoded > HISTORY_AGE_S:
             payloads, last = [payload for _, payload in self._ticks], self._seq
-            messages = [
+            messages = self._past.messages()
+            messages += [
                 encode_message("history", _RAW(_columns(payloads[first : first + PART_TICKS])))
                 for first in range(0, len(payloads), PART_TICKS)
             ]
             self._history = time.monotonic(), last, messages
         later = b",".join(payload for seq, payload in self._ticks if seq > last)
-        return [*self._past.messages, *messages], b"[%s]" % later
+        return messages, b"[%s]" % later
 
     # Requests
 

@@ -1,4 +1,7 @@
-"""Ten minutes of a fish for pages that open: the lowest and the highest values of short bins."""
+"""Ten minutes of a fish for pages that open: the lowest and the highest values of short bins.
+
+What costs little at each tick need not be computed while a page opens.
+"""
 
 import math
 from collections import deque
@@ -13,7 +16,7 @@ KEPT_S = 600.0
 BIN_S = 0.5
 """Time of a bin [s]."""
 PART_BINS = 20
-"""Number of bins in a message; its ticks must still be in the history of all ticks."""
+"""Number of bins in a message."""
 MAX_COLUMNS = 64
 """Number of columns, as in a page."""
 DIGITS = 6
@@ -25,10 +28,7 @@ Bin = dict[str, list[float]]
 
 
 class Past:
-    """Lowest and highest values of the ticks of a fish, encoded once.
-
-    What costs little at each tick need not be computed while a page opens.
-    """
+    """Lowest and highest values of the ticks of a fish, encoded once."""
 
     def __init__(self) -> None:
         parts = math.ceil(KEPT_S / BIN_S / PART_BINS)
@@ -41,10 +41,9 @@ class Past:
         self._bins: list[tuple[int, Bin]] = []
         """Number and values of each bin that is in no message yet."""
 
-    @property
-    def messages(self) -> Iterable[bytes]:
-        """Messages for a page, with all but the latest bins."""
-        return self._messages
+    def messages(self) -> list[bytes]:
+        """Return messages for a page; only the latest bins need to be encoded."""
+        return [*self._messages, *([_encode(self._bins)] if self._bins else [])]
 
     def add(self, tick: Tick) -> None:
         """Add a tick."""

@@ -1,5 +1,5 @@
 // One chart: a uPlot, made once; only its data, title and ranges change.
-import { number, timeOfDay } from "./common.js";
+import { html, number, render, timeOfDay } from "./common.js";
 import { followPointers } from "./gestures.js";
 
 const HEIGHT = 132;
@@ -55,25 +55,14 @@ export class Chart {
   constructor(parent, definition, owner) {
     Object.assign(this, { definition, owner, visible: true, factor: 1, unit: definition.unit ?? "" });
     this.known = !definition.truth && definition.key !== undefined;
-    const add = (node, kind) => node.appendChild(document.createElement(kind));
-    this.root = add(parent, "figure");
+    this.root = parent.appendChild(document.createElement("figure"));
     this.root.className = "chart";
-    const caption = add(this.root, "figcaption");
-    this.titleNode = add(caption, "span");
-    this.keys = add(caption, "span");
-    this.keys.className = "keys";
-    this.readout = add(caption, "output");
-    this.readout.setAttribute("aria-live", "off");
-    this.plotNode = add(this.root, "div");
-    this.plotNode.className = "plot";
-    const reader = { role: "application", "aria-roledescription": "chart", "aria-describedby": "chart-help", tabindex: "0" };
-    for (const name in reader) this.plotNode.setAttribute(name, reader[name]);
+    render(html`<figcaption><span /><span class="keys">${definition.series.filter(({ name }) => name).map(({ name, stroke, column }) =>
+      html`<span data-column=${column} style=${{ "--key": `var(--${stroke})` }}>${name}</span>`)}</span><output aria-live="off" /></figcaption>
+      <div class="plot" tabindex="0" role="application" aria-roledescription="chart" aria-describedby="chart-help" />`, this.root);
+    [this.titleNode, this.keys, this.readout] = this.root.firstChild.children;
+    this.plotNode = this.root.lastChild;
     this.setTitle();
-    for (const { name, stroke, column } of definition.series.filter((series) => series.name)) {
-      const key = Object.assign(add(this.keys, "span"), { textContent: name });
-      key.dataset.column = column;
-      key.style.setProperty("--key", `var(--${stroke})`);
-    }
     this.data = [owner.times, ...definition.series.map(() => owner.newColumn())];
     this.plot = new globalThis.uPlot(this.#options(), this.data, this.plotNode);
     this.size();

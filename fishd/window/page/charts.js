@@ -141,7 +141,7 @@ export class Charts {
   press(event, chart) {
     const step = (by) => {
       const { ring } = this, [low, high] = this.view.span(ring.latest?.time), level = ring.level(low, high);
-      this.setCursor(Math.min(ring.latest.time, Math.max(level.oldest, (this.cursor ?? high) + by * level.step)));
+      this.setCursor(Math.min(ring.latest.time, Math.max(level.oldest, (this.cursor ?? high) + by * level.period)));
       this.draw(Infinity);
       this.say(`${chart.text}: ${chart.readout.value}, ${number(this.cursorTick.age, 2)} s ago`);
     };
@@ -206,7 +206,7 @@ export class Charts {
 
   /** Take times and gaps of the view from the ticks or the bins. */
   #take(level, skip) {
-    this.length = Math.min(level.capacity, Math.ceil(this.view.seconds / level.step) + 64);
+    this.length = Math.min(level.capacity, Math.ceil(this.view.seconds / level.period) + 64);
     if (this.length !== this.times.length) [this.times, this.numbers] = [this.newColumn(), this.newColumn()];
     const { times, numbers, length } = this;
     level.copyTimes(times, skip);

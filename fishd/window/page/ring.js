@@ -1,7 +1,7 @@
 // What a page keeps of ten minutes: the latest ticks, and of all of them the extremes of short bins.
 /** Time that charts can show [s], and the time that they show tick by tick [s]. */
 export const KEPT_S = 600, EVERY_TICK_S = 120;
-/** Length of a bin, of which each column keeps its lowest and its highest value [s]. */
+/** Length of a bin, of which each column keeps its lowest and its highest value, as in past.py [s]. */
 const BIN_S = 0.5;
 const MIN_ROWS = 2400, MAX_ROWS = 24_000, SPARE_ROWS = 256;
 const MAX_COLUMNS = 64;
@@ -15,8 +15,9 @@ export const QUANTITY = "quantity:", READING = "reading:";
 
 /** Columns of fixed length, in which each further row replaces the oldest; NaN where there is no value. */
 class Columns {
-  constructor(capacity) {
-    this.capacity = capacity;
+  /** capacity: number of rows; period: time between two of them [s] */
+  constructor(capacity, period) {
+    Object.assign(this, { capacity, period });
     this.clear();
   }
 
@@ -37,7 +38,9 @@ class Columns {
   }
 
   /** Return whether a column has ever had a value. */
-  has = (name) => this.columns.has(name);
+  has(name) {
+    return this.columns.has(name);
+  }
 
   /** Return how many rows have more than this value in a column that only grows. */
   newer(value, name = "time") {
@@ -66,7 +69,7 @@ class Columns {
   copyTimes(target, skip = 0) {
     this.copy("time", target, 1, skip);
     const first = target.length - Math.max(0, Math.min(this.rows - skip, target.length));
-    for (let i = first - 1; i >= 0; i--) target[i] = (target[i + 1] ?? 0) - this.step;
+    for (let i = first - 1; i >= 0; i--) target[i] = (target[i + 1] ?? 0) - this.period;
   }
 
   addRow(time) {
@@ -90,15 +93,9 @@ class Columns {
 
 /** The lowest and the highest value of each bin, in two rows; a row without values where ticks are missing. */
 class Past extends Columns {
-  constructor(period) {
-    super(2 * Math.ceil(KEPT_S / BIN_S) + SPARE_ROWS);
-    this.step = 0.5 * BIN_S;
-    this.gap = BIN_S + Math.max(1, 4 * period);
-  }
-
-  clear() {
-    super.clear();
-    this.bin = -Infinity;
+  constructor(gap) {
+    super(2 * Math.ceil(KEPT_S / BIN_S) + SPARE_ROWS, 0.5 * BIN_S);
+    Object.assign(this, { gap, bin: -Infinity });
   }
 
   /** Add values at a time, unless they are of an earlier bin. */
@@ -124,16 +121,13 @@ class Past extends Columns {
 /** The latest ticks; a row of NaN where some were lost. */
 export class Ring extends Columns {
   constructor(period) {
-    super(Math.min(MAX_ROWS, Math.max(MIN_ROWS, Math.ceil(KEPT_S / period))) + SPARE_ROWS);
-    this.period = this.step = period;
-    this.past = new Past(period);
+    super(Math.min(MAX_ROWS, Math.max(MIN_ROWS, Math.ceil(KEPT_S / period))) + SPARE_ROWS, period);
   }
 
   clear() {
     super.clear();
-    this.past?.clear();
-    this.lost = 0;
-    this.latest = null;
+    const gap = Math.max(1, 4 * this.period);
+    Object.assign(this, { gap, past: new Past(gap + BIN_S), lost: 0, latest: null });
   }
 
   /** Add a tick; a gap before it becomes a row without values. */
@@ -142,7 +136,7 @@ export class Ring extends Columns {
     if (before) {
       if (tick.time < before.time - CLOCK_JUMP_S) this.clear();
       else if (tick.time <= before.time) return;
-      else if (tick.seq !== before.seq + 1 || tick.time - before.time > Math.max(1, 4 * this.period)) {
+      else if (tick.seq !== before.seq + 1 || tick.time - before.time > this.gap) {
         if (tick.seq > before.seq + 1) {
           this.lost += tick.seq - before.seq - 1;
           this.lostAt = tick.time;
@@ -181,7 +175,7 @@ export class Ring extends Columns {
   /** Return the unix time of a time. */
   unixTime(time) {
     const level = time >= this.oldest ? this : this.past;
-    const t = level.value("t", Math.max(1, level.newer(time - 0.5 * level.step)));
+    const t = level.value("t", Math.max(1, level.newer(time - 0.5 * level.period)));
     return Number.isNaN(t) ? this.latest.t - this.latest.time + time : t;
   }
 }
@@ -202,15 +196,10 @@ function valuesOf(tick) {
 }
 
 /** Yield the ticks, or the rows of bins, that columns of the history hold. */
-export function* ticksOf(history) {
-  const { quantities = {}, readings = {}, ...columns } = history;
+export function* ticksOf({ quantities = {}, readings = {}, ...columns }) {
+  const at = (named, row) =>
+    Object.fromEntries(Object.entries(named).map(([name, column]) => [name, column[row]]).filter(([, value]) => value != null));
   for (let row = 0; row < columns.seq.length; row++) {
-    const tick = {};
-    for (const name in columns) if (columns[name][row] != null) tick[name] = columns[name][row];
-    for (const [kind, named] of Object.entries({ quantities, readings })) {
-      const own = Object.entries(named).filter(([, column]) => column[row] != null);
-      if (own.length) tick[kind] = Object.fromEntries(own.map(([name, column]) => [name, column[row]]));
-    }
-    yield tick;
+    yield { ...at(columns, row), quantities: at(quantities, row), readings: at(readings, row) };
   }
 }

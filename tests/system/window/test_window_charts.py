@@ -136,8 +136,8 @@ def test_a_pointer_pans_by_dragging_and_zooms_around_itself_with_ctrl_and_the_wh
     page.mouse.move(x, y)
     page.keyboard.down("Control")
     page.mouse.wheel(0, 200)
-    page.keyboard.up("Control")
     wait_until(lambda: span(page)[1] - span(page)[0] > 20.0)
+    page.keyboard.up("Control")
     wider_low, wider_high = span(page)
     at = 0.75  # the time below the pointer has not moved
     assert wider_low + at * (wider_high - wider_low) == pytest.approx(
