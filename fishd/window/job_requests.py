@@ -47,7 +47,7 @@ class JobRequests:
             web.post("/api/jobs/{job}/dismiss", self._dismiss_job),
             web.get("/api/runs", self._list_runs),
             web.get("/api/runs/{run}/plot.png", self._plot_run),
-            *RunRequests(access, jobs.runs, self._waiting_for_disk).routes,
+            *RunRequests(access, jobs.runs, self.waiting_for_disk).routes,
         ]
 
     @contextmanager
