@@ -17,6 +17,7 @@ from fishd.window.fish_link import Busy, FishLink
 from fishd.window.job_options import DRIVING_KINDS, KINDS, MEASURED_KINDS, list_words
 from fishd.window.jobs import Jobs
 from fishd.window.pages import Pages
+from fishd.window.run_requests import RunRequests
 
 MAX_WAITING_REQUESTS = 16
 """Number of requests that wait for the disk of runs above which a further one is refused."""
@@ -46,6 +47,7 @@ class JobRequests:
             web.post("/api/jobs/{job}/dismiss", self._dismiss_job),
             web.get("/api/runs", self._list_runs),
             web.get("/api/runs/{run}/plot.png", self._plot_run),
+            *RunRequests(access, jobs.runs, self.waiting_for_disk).routes,
         ]
 
     @contextmanager
