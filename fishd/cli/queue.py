@@ -56,9 +56,10 @@ def _queue_options(function: F) -> F:
 def add(
     context: click.Context, words: tuple[str, ...], repeat: int, file: QueueFile, as_json: bool
 ) -> None:
-    """Add an experiment at the end: its words after 'fishctl', such as measure swing --for 60.
+    """Add an experiment: the words after 'fishctl'.
 
-    The words are checked now, as its verb does before the fish swims.
+    For example: fishctl queue add measure swing --for 60 --repeat 3. The words are checked now, as
+    their verb does before the fish swims.
     """
     if words[0] not in EXPERIMENTS:
         known = ", ".join(EXPERIMENTS)
@@ -138,7 +139,7 @@ def _format_time(t: float) -> str:
 @click.argument("position", type=click.IntRange(1, MAX_ITEMS))
 @_queue_options
 def move(number: int, position: int, file: QueueFile, as_json: bool) -> None:
-    """Move an experiment to a position, 1 for the first."""
+    """Move an experiment; position 1 is the first."""
     with file.changing() as content:
         content.move(number, position)
     _show(file, as_json)
@@ -148,7 +149,7 @@ def move(number: int, position: int, file: QueueFile, as_json: bool) -> None:
 @click.argument("number", type=int)
 @_queue_options
 def remove(number: int, file: QueueFile, as_json: bool) -> None:
-    """Remove an experiment that does not run; what it has measured is kept."""
+    """Remove an experiment that does not run. What it has measured is kept."""
     with file.changing() as content:
         content.remove(number)
     _show(file, as_json)
@@ -157,7 +158,7 @@ def remove(number: int, file: QueueFile, as_json: bool) -> None:
 @queue.command()
 @_queue_options
 def clear(file: QueueFile, as_json: bool) -> None:
-    """Remove all experiments but the one that runs; all runs are kept."""
+    """Remove all experiments but the one that runs. All runs are kept."""
     with file.changing() as content:
         content.clear()
     _show(file, as_json)

@@ -123,7 +123,7 @@ class QueueRunner:
         self._take, self._last_line = False, ""
         echo(f"fishctl: experiment {item.id}: {' '.join(item.words)}", err=True)
         try:
-            # Its own session: Ctrl-C in this terminal is for the runner, which passes it on once.
+            # In a session of its own, as Ctrl-C in this terminal is for the runner.
             child = subprocess.Popen(
                 fishctl_command(words),
                 stdin=subprocess.DEVNULL,

@@ -48,7 +48,7 @@ class Item(Struct, forbid_unknown_fields=True):
 
     id: int
     words: list[str]
-    """Its verb and arguments."""
+    """Verb and arguments."""
     cwd: str
     """Folder in which it was added, to which relative paths belong."""
     repeat: Repeat = 1
@@ -68,7 +68,7 @@ class Past(Struct, forbid_unknown_fields=True):
     """Unix time [s]."""
     outcome: Outcome
     message: str = ""
-    """Its result, or the reason why it failed."""
+    """Result, or the reason of a failure."""
 
 
 class Queue(Struct, forbid_unknown_fields=True):
@@ -140,7 +140,7 @@ class Queue(Struct, forbid_unknown_fields=True):
 
 
 class View(Queue):
-    """The queue as it is shown; `current` is the item that runs."""
+    """A queue for display; `current` is the item that runs."""
 
     state: Literal["running", "paused", "empty"] = "empty"
     elapsed: float = 0.0
@@ -199,7 +199,7 @@ class QueueFile:
     def changing(self) -> Iterator[Queue]:
         """Yield the newest queue, which is written at the end, while no other process changes it.
 
-        Raise `QueueError`; the file is then as it was.
+        Raise `QueueError`, without a change of the file.
         """
         try:
             self.runs.mkdir(parents=True, exist_ok=True)
@@ -216,7 +216,7 @@ class QueueFile:
             raise
         except OSError as error:
             raise QueueError(
-                f"{self.path} cannot be written: {error.strerror}; the queue is as it was"
+                f"{self.path} cannot be written: {error.strerror}; the queue is unchanged"
             ) from None
 
     @contextmanager
@@ -234,7 +234,7 @@ class QueueFile:
         return find_lock_holder(self._runner)
 
     def view(self) -> View:
-        """Return the queue as it is shown; raise `QueueError`."""
+        """Return the queue for display; raise `QueueError`."""
         is_running = self.find_runner() is not None  # first: a runner that ends has written before
         queue = self.read()
         if not is_running and queue.current is not None:

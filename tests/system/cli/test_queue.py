@@ -158,7 +158,7 @@ def test_a_run_that_fails_pauses_the_queue_and_stays_its_first(
 
 
 def test_an_experiment_of_a_controller_that_has_gone_is_one_line(terminal: Terminal) -> None:
-    with terminal.file.changing() as queue:  # as it was added while its package was installed
+    with terminal.file.changing() as queue:  # it was added while its package was installed
         queue.add(["measure", "sculling"], 1, 60.0)
     status, _ = terminal.run()
     assert status == 1

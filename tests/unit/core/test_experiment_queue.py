@@ -98,7 +98,7 @@ def test_a_disk_that_is_full_leaves_the_queue_as_it_was(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(experiment_queue, "write_atomically", refuse)
-    with pytest.raises(QueueError, match=r"cannot be written: No space .*; the queue is as it was"):
+    with pytest.raises(QueueError, match=r"cannot be written: No space .*; the queue is unchanged"):
         add(file, 60.0)
     assert order(file) == [1]
 
@@ -118,7 +118,7 @@ def test_what_ran_when_its_runner_was_killed_is_said_and_nothing_runs_any_more(
     view = file.view()
     assert (view.state, view.current, view.elapsed) == ("paused", None, 0.0)
     assert "went down while experiment 1 ran, which began at 2001-09-" in view.reason
-    add(file, 60.0)  # a change keeps what was found
+    add(file, 60.0)  # a change keeps the reason
     assert file.read().reason == view.reason
     assert file.read().current is None
 
