@@ -178,6 +178,8 @@ class QueueFile:
     def read(self) -> Queue:
         """Return the queue; raise `QueueError` for a file that this fishd does not understand."""
         try:
+            if self.path.is_symlink():
+                raise FileProblem("is a symbolic link; a regular file is needed")
             content = files.read(self.path, MAX_FILE_BYTES, "a queue")
             if (version := _decode_version(content).version) > VERSION:
                 raise QueueError(

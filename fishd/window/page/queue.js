@@ -98,13 +98,14 @@ export function Queue({ page }) {
 function Item({ item, place, queue, mayDrive, passed, send }) {
   const runs = item.id === queue.current, number = { number: item.id }, words = item.words.join(" ");
   const elapsed = queue.elapsed + passed, each = item.seconds === null ? "" : duration(item.seconds);
-  const what = runs ? `runs, ${duration(elapsed)}${each && ` of about ${each}`}` : `${item.run ? "interrupted, is resumed" : "waits"}${each && `, about ${each} each`}`;
+  const waits = item.run ? "interrupted, is resumed" : "waits";
+  const what = runs ? `runs, ${duration(elapsed)}${each && ` of about ${each}`}` : `${waits}${each && `, about ${each} each`}`;
   const button = (text, label, action, isOff) => html`<button type="button" aria-label=${`${label} ${words}`} title=${label}
     disabled=${!mayDrive || isOff} onClick=${action}>${text}</button>`;
   return html`<li class="queued">
     <div class="job-head"><span class="muted">${what}</span><span class="buttons">
-      <label class="special">Runs <input class="number" type="number" min="1" max="1000" value=${item.repeat} disabled=${!mayDrive} aria-label=${`Runs of ${words}`}
-        onChange=${(event) => event.target.value > 0 && send("repeat", { ...number, repeat: Number(event.target.value) })()} /></label>
+      <label class="special">Runs <input class="number" type="number" min="1" max="1000" value=${item.repeat} disabled=${!mayDrive}
+        aria-label=${`Runs of ${words}`} onChange=${({ target }) => send("repeat", { ...number, repeat: Number(target.value) })()} /></label>
       ${button("↑", "Move up", send("move", { ...number, position: place }), place === 0)}
       ${button("↓", "Move down", send("move", { ...number, position: place + 2 }), place === queue.items.length - 1)}
       ${button("Remove", "Remove", send("remove", number), runs)}</span></div>

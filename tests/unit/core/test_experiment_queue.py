@@ -89,6 +89,18 @@ def test_a_file_that_is_not_understood_is_one_line_and_stays_as_it_is(
     assert file.path.read_bytes() == content
 
 
+def test_a_link_to_another_file_is_neither_read_nor_replaced(
+    file: QueueFile, tmp_path: Path
+) -> None:
+    add(file, 60.0)
+    file.path.rename(tmp_path / "elsewhere.json")
+    file.path.symlink_to(tmp_path / "elsewhere.json")
+    for use in (file.view, lambda: add(file, 1.0)):
+        with pytest.raises(QueueError, match="is a symbolic link; a regular file is needed"):
+            use()
+    assert file.path.is_symlink()
+
+
 def test_a_disk_that_is_full_leaves_the_queue_as_it_was(
     file: QueueFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
