@@ -17,7 +17,7 @@ export function sliderOf(field, status) {
 }
 
 /** A text field that keeps what is being typed while the page is drawn again. */
-function Text({ value, commit, ...more }) {
+export function Text({ value, commit, ...more }) {
   const [draft, setDraft] = useState(null);
   return html`<input autocomplete="off" spellcheck=${false} ...${more} value=${draft ?? value}
     onInput=${(event) => setDraft(event.target.value)} onBlur=${() => setDraft(null)}
