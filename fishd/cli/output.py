@@ -82,9 +82,9 @@ def print_paths(paths: Iterable[Path], as_json: bool) -> None:
             echo(path)
 
 
-def print_json_line(value: Any) -> None:
-    """Print any struct as one line of JSON."""
-    click.echo(_escape_unprintable(msgspec.json.encode(value)))
+def print_json_line(value: Any, *, err: bool = False) -> None:
+    """Print any struct as one line of JSON; err: on standard error."""
+    click.echo(_escape_unprintable(msgspec.json.encode(value)), err=err)
 
 
 def make_printable(value: T) -> T:

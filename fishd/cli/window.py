@@ -78,6 +78,14 @@ def start(log_format: str, **values: Any) -> None:
     exit_now(serve(load_options(**values), log_format))
 
 
+@window.command(hidden=True)
+def forms() -> None:
+    """Print the forms of the page's experiments, as JSON."""
+    from fishd.cli.forms import describe_forms
+
+    print_json(describe_forms())
+
+
 @window.command()
 @window_options
 @click.option(
