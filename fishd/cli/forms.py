@@ -106,6 +106,7 @@ def _describe_option(option: click.Option, source: _Source) -> FormField | None:
     name, kind = option.name or "", option.type
     if option.opts[0] in _LEFT_OUT or option.multiple:
         return None
+    units = {"SECONDS": "s", "MN": "mN"}
     default = option.default if isinstance(option.default, bool | int | float | str) else None
     more: dict[str, Any] = {}
     if name == "on":
@@ -129,7 +130,8 @@ def _describe_option(option: click.Option, source: _Source) -> FormField | None:
         more = {"low": bounds[0], "high": bounds[1]}
     return FormField(
         **{
-            "name": name, "kind": described, "unit": "", "description": option.help or "",
+            "name": name, "kind": described, "unit": units.get(option.metavar or "", ""),
+            "description": option.help or "",
             "default": default, "optional": False, "option": option.opts[0],
             "on": option.on if isinstance(option, FishOption) else "",
             "main": name in ("on", *source.main), "initial": source.initial.get(name), **more,

@@ -51,7 +51,13 @@ async def test_a_device_that_is_not_paired_gets_only_the_page(window: WindowProc
     async with Browser(window.url, NETWORK_HOST) as browser:
         session = await browser.get("/api/session")
         assert (session["paired"], session["scope"], session["device"]) == (False, None, None)
-        for path in ("/api/fish", "/api/fish/fish/policies", "/api/jobs", "/api/runs"):
+        for path in (
+            "/api/fish",
+            "/api/fish/fish/policies",
+            "/api/forms",
+            "/api/jobs",
+            "/api/runs",
+        ):
             assert await browser.refusal(path) == (401, "not-paired")
         for path in ("estop", "drive", "release", "request"):
             assert await browser.refusal(f"/api/fish/fish/{path}", {}) == (401, "not-paired")
