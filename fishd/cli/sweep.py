@@ -189,6 +189,9 @@ def _curve_point(
     point: "Point", points: "Sequence[Point]", result: "PointResult", quantity: "Quantity"
 ) -> CurvePoint | None:
     """Return a result over the first number that varies; None if it has none, or no result."""
+    from fishd.controllers import registry
+
+    units = registry.units(point.controller)
     values = point.columns()
     for name, x in values.items():
         is_number = isinstance(x, int | float) and not isinstance(x, bool)
@@ -201,6 +204,7 @@ def _curve_point(
     ci95, unit = result.value_ci95, quantity.unit
     series = point.label(without=(name,))
     x_name = name.rpartition(".")[2]
+    x_name += f" [{units[x_name]}]" if units.get(x_name, "1") != "1" else ""
     return CurvePoint(x, result.value, ci95, x_name, quantity.name, unit, series)
 
 

@@ -144,8 +144,8 @@ class Jobs:
         """Return what is left of a job that was lost; mark it done or resumable if it is."""
         what = "fishd-window was killed while this ran"
         if job.run:
-            self._conclude(job)
-            if job.state == "done":
+            if self._conclude(job):
+                job.state = "done"
                 return "fishd-window was killed, but this was complete"
             rests = f"{what}, and the fish came to rest"
             kept = f"what was measured until then is in {job.run}"
@@ -154,18 +154,20 @@ class Jobs:
             return f"{what}; what was recorded until then is among the runs"
         return f"{what}; start it again"
 
-    def _conclude(self, job: Job) -> None:
-        """Find out whether an experiment that has ended is complete, or can be resumed."""
+    def _conclude(self, job: Job) -> bool:
+        """Return whether an experiment that has ended is complete; else it can be resumed.
+
+        A complete one may end with status 1, such as a search that has used up its time.
+        """
         header = self.runs.read_header(job.run) if job.run else None
-        if header is None:
-            return
-        if not header.ended:
-            job.resumable = True
-        elif job.state == "lost":
-            job.state = "done"
+        job.resumable = header is not None and not header.ended and job.exit != 0
+        if header is None or not header.ended:
+            return job.exit == 0
+        if job.state == "lost":
             with suppress(files.FileProblem, msgspec.DecodeError):
                 path = self._folder / job.run / "result.json"
                 job.result = decoder(Any)(files.read(path, MAX_OUTPUT_BYTES, "a result"))
+        return True
 
     def _new_id(self) -> str:
         self._count += 1
@@ -317,8 +319,8 @@ class Jobs:
                 curve = await read_curve(self._recording_of(job), self._folder)
                 job.result = {**job.result, "curve": curve}
             stopped = job.id in self._stopping
-            await asyncio.to_thread(self._conclude, job)
-            job.state = "stopped" if stopped else "done" if job.exit == 0 else "failed"
+            is_complete = await asyncio.to_thread(self._conclude, job)
+            job.state = "stopped" if stopped else "done" if is_complete else "failed"
         except (OSError, FishdError) as error:
             job.lines.append(text.describe_error(error))
             job.state = "failed"

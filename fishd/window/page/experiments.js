@@ -188,7 +188,7 @@ function Job({ job, state, notice, mayDrive, resume }) {
     <code tabindex="0" aria-label="Command line">${job.command.map(quote).join(" ")}</code>
     ${hasAnswer ? html`${doing && html`<p class="result">${sentence(doing)}</p>`}<${Estimates} estimates=${estimates} title="result" />` : html`<${Result} job=${job} status=${state.status} />`}
     <${Growing} points=${job.points} />
-    ${job.state !== "done" && !(job.state === "stopped" && job.result) && job.lines?.length > 0 && html`<p class="last">${plain(job.lines.at(-1))}</p>`}
+    ${(job.state !== "done" || job.exit !== 0) && !(job.state === "stopped" && job.result) && job.lines?.length > 0 && html`<p class="last">${plain(job.lines.at(-1))}</p>`}
   </li>`;
 }
 

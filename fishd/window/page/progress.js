@@ -14,8 +14,9 @@ function textsOf({ value, low, high, unit }) {
     const [middle, error] = interval(value * factor, half);
     return [`${middle} ${name}`, error];
   }
-  const decimals = Math.min(6, Math.max(0, half > 0 ? 1 - Math.floor(Math.log10(half)) : 3));
-  const [middle, ...ends] = [value, low, high].map((x) => number(x * factor, decimals));
+  const shown = [value, low, high].map((x) => x * factor), least = Math.min(...shown.map(Math.abs).filter((x) => x > half / 1000));
+  const decimals = Math.min(6, Math.max(0, half > 0 ? 1 - Math.floor(Math.log10(least)) : 3));
+  const [middle, ...ends] = shown.map((x) => number(x, decimals));
   return [`${middle} ${name}`, `[${ends.join(", ")}]`];
 }
 

@@ -236,7 +236,7 @@ async def test_an_experiment_on_a_simulated_fish_shows_its_curve_and_leaves_the_
         job = await start(page, "optimise", **options, on="simulation")
         ended = await end_of(page, job)
         assert ended["state"] == "done", ended["lines"]
-        assert [point["x_name"] for point in ended["points"]][0] == "frequency [Hz]"
+        assert ended["points"][0]["x_name"] == "frequency [Hz]"
         assert len(ended["points"]) == ended["result"]["trials"]
         best, thrust = ended["progress"]["estimates"]
         assert (best["name"], best["unit"]) == ("best frequency", "Hz")

@@ -415,9 +415,9 @@ def test_a_form_says_at_once_what_its_job_would_refuse(new_window: WindowProcess
         page.select_option("#controller", "thrust")
         expect(page.locator("#preview")).to_contain_text("Needed first")
         expect(start).to_be_disabled()
-        page.select_option("#controller", "hold")
-        page.click("#tab-sweep")
-        expect(page.locator("#preview")).to_contain_text("hold has no parameter to vary")
+        page.select_option("#controller", "ppo")
+        page.click("#tab-optimise")
+        expect(page.locator("#preview")).to_contain_text("ppo has no number to search")
         expect(start).to_be_disabled()
 
 
@@ -624,6 +624,9 @@ def test_no_barrier_is_serious(window: WindowProcess) -> None:
             page.set_viewport_size({"width": width, "height": 844})
             for place in ("experiments", "runs", "fish", "live"):
                 go(page, place)
+                if place == "experiments":
+                    page.click("#tab-optimise")
+                    page.locator("#experiment details").evaluate("node => node.open = true")
                 refuse_barriers(page)
         page.click("#estop")
         expect(page.locator("#latched")).to_be_visible()
