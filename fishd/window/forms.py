@@ -41,7 +41,7 @@ class Forms:
         async with self._reading:
             if not self._known:
                 try:
-                    forms = _decode_forms(await call(["window", "forms"], self._runs))
+                    forms = _decode_forms(await call(["window", "forms", "--json"], self._runs))
                 except msgspec.DecodeError as error:
                     raise JobError(
                         f"the forms cannot be read: {text.error_message(error)}"

@@ -92,6 +92,10 @@ async def test_a_device_that_may_watch_sees_the_fish_stops_it_and_nothing_more(
         for what in ("drive", "release", "request"):
             assert await page.refusal(what) == (403, "only-watch")
         assert await page.refusal("/api/jobs") == (403, "only-watch")
+        body = {"fish": "fish", "kind": "measure", "options": {"controller": "square"}}
+        checked = await page.post("/api/jobs/check", body)
+        assert (checked["problem"], checked["plan"]) == ("", None)  # it starts no process
+        assert "measure" in [form["kind"] for form in await browser.get("/api/forms")]
         assert (await page.post("estop"))["way"] == "control"
     async with Browser(window.url) as browser, open_page(browser) as page:
         await page.drive()

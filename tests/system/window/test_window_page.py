@@ -573,7 +573,7 @@ def test_the_keyboard_reaches_everything_and_the_focus_is_visible(window: Window
 def walk(page: Page) -> None:
     """Reach everything that is shown with the Tab key, in reading order, the E-stop first."""
     reachable = page.evaluate("""() => {
-        const kinds = "button, input, select, a[href], [tabindex='0']";
+        const kinds = "button, input, select, summary, a[href], [tabindex='0']";
         const isReachable = (node) => !node.disabled && node.checkVisibility();
         globalThis.wanted = [...document.querySelectorAll(kinds)].filter(isReachable);
         return wanted.length;
