@@ -68,9 +68,9 @@ def _describe(root: click.Group, kind: str, source: _Source) -> Form:
     words = (source.words or kind).split()
     context, command = click.Context(root), root
     for word in words:
-        found = command.get_command(context, word)
-        assert found
-        command = found  # type: ignore[assignment]
+        verb = command.get_command(context, word)
+        assert verb
+        command = verb  # type: ignore[assignment]
     values: Any = ""
     params: Sequence[click.Parameter] = command.params
     if isinstance(command, ControllerGroup):

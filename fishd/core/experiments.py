@@ -39,7 +39,7 @@ class Form(Struct, frozen=True, omit_defaults=True):
     without_argument: list[str] = []
     """Options that it needs if no argument is given."""
     values: Literal["", "one", "several", "range"] = ""
-    """What a parameter of the controller takes."""
+    """Number of values that a parameter of the controller takes."""
     fields: list[FormField] = []
     is_experiment: bool = False
     """Whether it takes `--on`, and swims the live fish unless that is `simulation`."""
@@ -50,7 +50,7 @@ class Form(Struct, frozen=True, omit_defaults=True):
 
 
 class Plan(Struct, frozen=True):
-    """What an experiment is going to do, if nothing is wrong with it."""
+    """Amount of work of an experiment with which nothing is wrong."""
 
     amount: float
     unit: str

@@ -77,7 +77,7 @@ def swims(form: Form, options: Any) -> bool:
 def check_parameters(options: Any, controllers: Collection[ControllerInfo]) -> None:
     """Raise `ParameterError` unless each parameter is one of the controller, with a safe value.
 
-    A name is no other option then. A path has the suffix that the controller reads.
+    So a name is not one of the verb's own options. A path has the suffix that the controller reads.
     """
     fields = {
         field.name: field

@@ -32,7 +32,7 @@ class JobRequest(Struct, forbid_unknown_fields=True):
 
 
 class _WantedJob(NamedTuple):
-    """A job that a page wants, as far as it was checked."""
+    """Job that a page wants, with checked options."""
 
     form: Form | None
     """None for an experiment that is resumed."""

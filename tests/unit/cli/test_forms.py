@@ -9,9 +9,15 @@ from fishd.cli.forms import describe_forms
 from fishd.cli.main import VERBS
 from fishd.core.experiments import Form
 
-NEVER = {*RUN_ONLY_OPTIONS, "--config", "--set", "--to", "--jobs", "--seeds", "--settings"} - {
-    "--on"
-}
+FORBIDDEN_OPTIONS = {
+    *RUN_ONLY_OPTIONS,
+    "--config",
+    "--set",
+    "--to",
+    "--jobs",
+    "--seeds",
+    "--settings",
+} - {"--on"}
 """Options that no page may give: other files, other fish, any number of processes."""
 
 
@@ -26,7 +32,7 @@ def test_each_experiment_of_the_command_line_has_a_form() -> None:
 def test_a_form_offers_no_file_no_other_fish_and_no_number_of_processes() -> None:
     offered = {field.option for form in forms().values() for field in form.fields}
     assert {"--for", "--budget", "--seed", "--note", "--fit", "--on"} <= offered
-    assert offered & NEVER == set()
+    assert offered & FORBIDDEN_OPTIONS == set()
 
 
 def test_a_field_has_kind_bounds_default_and_help_of_its_option() -> None:
