@@ -1,23 +1,27 @@
 """The verbs of the queue of experiments of a fish."""
 
+import io
 import shlex
 import time
+from collections.abc import Sequence
+from contextlib import redirect_stdout
 from datetime import datetime, timedelta
 from functools import wraps
 from typing import Any
 
 import click
+import msgspec
 
-from fishd.cli import dry_run
 from fishd.cli.options import F, Utf8Text, daemon_options, take_option, verb_lease
 from fishd.cli.output import echo, echo_table, format_count, print_json
-from fishd.core.errors import FishdError
+from fishd.core.errors import FishdError, NoDaemon
 from fishd.core.experiment_queue import MAX_ITEMS, MAX_REPEAT, QueueFile, View
+from fishd.core.experiments import Plan
 from fishd.recording.folder import runs_folder
 
 EXPERIMENTS = ("measure", "sweep", "compare", "optimise", "identify", "adapt", "learn")
 """Verbs that a queue takes."""
-_CHOSEN_OPTIONS = ("--folder", "--resume", "--endpoint", "--json", "--take")
+_CHOSEN_OPTIONS = ("--folder", "--resume", "--endpoint", "--json", "--take", "--dry-run")
 """Options of an experiment that the queue chooses."""
 
 
@@ -67,7 +71,7 @@ def add(
     for word in words:
         if word.partition("=")[0] in _CHOSEN_OPTIONS:
             raise click.UsageError(f"{word.partition('=')[0]} is chosen by the queue; leave it out")
-    seconds = dry_run.check(context, words, file.address)
+    seconds = _check(context.find_root().command, words, file.address)
     with file.changing() as content:
         item = content.add(list(words), repeat, seconds)
     if as_json:
@@ -76,6 +80,25 @@ def add(
         each = "" if seconds is None else f", {_format_duration(seconds)} each"
         runs = format_count(repeat, "run")
         echo(f"experiment {item.id}: {shlex.join(words)} ({runs}{each})")
+
+
+def _check(fishctl: click.Command, words: Sequence[str], address: str) -> float | None:
+    """Return the expected duration of an experiment [s]; None if it is not known.
+
+    What only its fishd knows is not checked if that does not answer. Raises the errors of the verb.
+    """
+    place = ["--folder", "checked", "--dry-run", "--json"]
+    plan = io.StringIO()
+    try:
+        with redirect_stdout(plan):
+            fishctl.main(
+                ["--endpoint", address, *words, *place],
+                prog_name="fishctl",
+                standalone_mode=False,
+            )
+    except NoDaemon:
+        return None
+    return msgspec.json.decode(plan.getvalue(), type=Plan).seconds
 
 
 @queue.command("list")

@@ -2,6 +2,7 @@
 import { call, duration, html, numberIn, quote, sentence, useEffect, useState } from "./common.js";
 import { startJob } from "./experiments.js";
 import { Text } from "./fields.js";
+import { CHECK_TIMEOUT_MS } from "./forms.js";
 
 const POLL_MS = 2000;
 const clock = new Intl.DateTimeFormat([], { hour: "2-digit", minute: "2-digit", hourCycle: "h23" });
@@ -14,7 +15,7 @@ let latest = 0;
 async function ask({ state, changed }, change) {
   const mine = ++latest, path = `/api/fish/${encodeURIComponent(state.name)}/queue`;
   try {
-    const queue = await (change ? call("POST", path, change) : call("GET", path));
+    const queue = await (change ? call("POST", path, change, CHECK_TIMEOUT_MS) : call("GET", path));
     if (mine === latest) state.queue = { ...queue, received: performance.now(), failure: "" };
   } catch (error) {
     if (!change && mine === latest) state.queue = { ...state.queue, failure: error.message };
@@ -36,7 +37,7 @@ export function AddToQueue({ page, kind, options, disabled }) {
   const [isAdding, setAdding] = useState(false);
   const add = async () => {
     setAdding(true);
-    await change(page, "add", { kind, options: options() });
+    await change(page, "add", { kind, options });
     setAdding(false);
   };
   return html`<button type="button" disabled=${disabled || isAdding} onClick=${add}>${isAdding ? "Adding …" : "Add to queue"}</button>`;

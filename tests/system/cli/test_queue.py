@@ -107,7 +107,7 @@ def test_an_experiment_is_checked_while_another_one_swims_the_fish_and_disturbs_
         assert lease
         assert lease.pid == measuring.pid
         assert measuring.end(signal.SIGINT)[0] == 130
-    assert [path.suffix for path in terminal.runs.glob("queue*")] == [".json", ".lock"]
+    assert {path.suffix for path in terminal.runs.glob("queue*")} == {".json", ".lock"}
 
 
 def test_an_experiment_is_added_while_no_fishd_runs(

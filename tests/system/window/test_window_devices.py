@@ -51,7 +51,7 @@ async def test_a_device_that_is_not_paired_gets_only_the_page(window: WindowProc
     async with Browser(window.url, NETWORK_HOST) as browser:
         session = await browser.get("/api/session")
         assert (session["paired"], session["scope"], session["device"]) == (False, None, None)
-        for path in ("fish", "fish/fish/policies", "fish/fish/queue", "jobs", "runs"):
+        for path in ("fish", "fish/fish/policies", "fish/fish/queue", "forms", "jobs", "runs"):
             assert await browser.refusal(f"/api/{path}") == (401, "not-paired")
         for path in ("estop", "drive", "release", "request", "queue"):
             assert await browser.refusal(f"/api/fish/fish/{path}", {}) == (401, "not-paired")
@@ -87,6 +87,10 @@ async def test_a_device_that_may_watch_sees_the_fish_stops_it_and_nothing_more(
             assert await page.refusal(what) == (403, "only-watch")
         assert (await browser.get("/api/fish/fish/queue"))["state"] == "empty"
         assert await page.refusal("/api/jobs") == (403, "only-watch")
+        body = {"fish": "fish", "kind": "measure", "options": {"controller": "square"}}
+        checked = await page.post("/api/jobs/check", body)
+        assert (checked["problem"], checked["plan"]) == ("", None)  # it starts no process
+        assert "measure" in [form["kind"] for form in await browser.get("/api/forms")]
         assert (await page.post("estop"))["way"] == "control"
     async with Browser(window.url) as browser, open_page(browser) as page:
         await page.drive()

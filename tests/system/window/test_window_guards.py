@@ -53,7 +53,7 @@ async def test_no_name_that_leads_here_but_is_not_ours_gets_anything(
             "Host": authority, "Origin": f"http://{authority}",
             "X-Client": page.hello["client"],
         }  # fmt: skip
-        for path in ("/", "/api/session", "/api/fish", "/metrics"):
+        for path in ("/", "/api/session", "/api/fish", "/api/forms", "/metrics"):
             async with browser.session.get(path, headers=headers) as response:
                 assert response.status == 403
         for path, body in CHANGES:
@@ -100,7 +100,7 @@ async def test_another_site_starts_no_reading_either_where_the_browser_tells(
             headers = {"Sec-Fetch-Site": site}
             for path in (
                 *("/api/runs", "/api/trash", "/api/results?run=x", "/api/runs/x/download/all.zip"),
-                *("/api/fish/fish/queue", "/metrics"),
+                *("/api/fish/fish/queue", "/api/forms", "/metrics"),
             ):
                 refused = await browser.refusal(path, headers=headers)
                 assert refused == (403, "other-origin")

@@ -283,7 +283,7 @@ def test_a_page_works_in_a_browser_that_keeps_nothing(new_window: WindowProcess)
         swim(page)
         go(page, "experiments")
         page.click("#tab-record")
-        page.fill("#experiment label:has-text('Seconds') input", "0,5")
+        page.fill("#option-seconds", "0,5")
         page.click("#experiment button.primary")
         expect(page.locator(".job code")).to_contain_text("--for 0.5")
         assert complaints == []
@@ -381,7 +381,7 @@ def test_a_run_in_simulation_is_drawn_over_its_own_time_and_dismissed(
         go(page, "experiments")
         page.click("#tab-simulate")
         expect(page.locator("#preview")).to_have_text(
-            re.compile("fishctl simulate swing --for 20.*20.s of virtual time")
+            re.compile("fishctl simulate swing.*60.s of virtual time")
         )
         page.click("#experiment .primary")
         expect(page.locator(".job.done")).to_contain_text("True thrust")
@@ -398,7 +398,7 @@ def test_a_run_in_simulation_is_drawn_over_its_own_time_and_dismissed(
 def test_a_form_says_at_once_what_its_job_would_refuse(new_window: WindowProcess) -> None:
     with live_page(new_window.url) as (page, _):
         go(page, "experiments")
-        start, seconds = page.locator("#experiment .primary"), page.get_by_label("Seconds")
+        start, seconds = page.locator("#experiment .primary"), page.locator("#option-seconds")
         seconds.fill("20")
         expect(page.locator("#preview")).to_contain_text("20.25 to 3600 s are needed")
         expect(start).to_be_disabled()
@@ -409,9 +409,57 @@ def test_a_form_says_at_once_what_its_job_would_refuse(new_window: WindowProcess
         expect(page.locator("#preview")).to_contain_text("Needed first")
         expect(start).to_be_disabled()
         page.select_option("#controller", "ppo")
-        page.click("#tab-sweep")
-        expect(page.locator("#preview")).to_contain_text("ppo has no number to sweep")
+        page.click("#tab-optimise")
+        expect(page.locator("#preview")).to_contain_text("ppo has no number to search")
         expect(start).to_be_disabled()
+
+
+def test_every_experiment_of_the_command_line_has_a_form_with_its_preview(
+    new_window: WindowProcess,
+) -> None:
+    with live_page(new_window.url) as (page, complaints):
+        go(page, "experiments")
+        page.select_option("#controller", "square")
+        expect(page.get_by_role("tab")).to_have_count(9)
+        for kind in ("measure", "compare", "optimise", "identify", "adapt", "learn", "record"):
+            page.click(f"#tab-{kind}")
+            expect(page.locator("#preview code")).to_contain_text(f"fishctl {kind}")
+            expect(page.locator("#experiment .primary")).to_be_enabled()
+        assert complaints == []
+
+
+def test_a_search_on_a_simulated_fish_draws_its_curve_and_shows_the_best_with_its_interval(
+    new_window: WindowProcess,
+) -> None:
+    with live_page(new_window.url) as (page, complaints):
+        go(page, "experiments")
+        page.select_option("#controller", "square")
+        page.click("#tab-optimise")
+        page.get_by_label("Range").fill("1:3")
+        page.select_option("#option-on", "simulation")
+        expect(page.locator("#preview")).to_contain_text("--frequency 1:3 --on simulation")
+        page.click("#experiment .primary")
+        expect(page.locator(".job.done")).to_contain_text("best frequency")
+        expect(page.locator(".job.done")).to_contain_text("thrust there")
+        expect(page.get_by_role("img", name="Chart of thrust over frequency")).to_be_visible()
+        assert complaints == []
+
+
+def test_what_was_entered_is_kept_and_further_options_are_a_click_away(
+    new_window: WindowProcess,
+) -> None:
+    with live_page(new_window.url) as (page, _):
+        go(page, "experiments")
+        page.click("#tab-adapt")
+        page.locator("#option-budget").fill("200")
+        expect(page.locator("#option-no_command")).to_be_hidden()
+        page.get_by_text("More options").click()
+        expect(page.locator("#option-no_command")).to_be_checked()
+        page.select_option("#option-on", "simulation")
+        expect(page.locator("#option-no_command")).to_have_count(0)  # for a live fish only
+        expect(page.locator("#preview")).to_contain_text("fishctl adapt --budget 200 --on")
+        page.reload()
+        expect(page.locator("#option-budget")).to_have_value("200")
 
 
 def test_a_stored_run_is_opened_and_another_controller_is_run_on_it(
@@ -421,8 +469,8 @@ def test_a_stored_run_is_opened_and_another_controller_is_run_on_it(
         swim(page)
         go(page, "experiments")
         page.click("#tab-record")
-        page.get_by_label("Seconds").fill("1")
-        page.get_by_label("Note").fill("a; $(b) 'c'")
+        page.locator("#option-seconds").fill("1")
+        page.locator("#option-note").fill("a; $(b) 'c'")
         page.click("#experiment .primary")
         expect(page.locator(".job.done")).to_be_visible()
         page.select_option("#controller", "sine")
@@ -583,6 +631,9 @@ def test_no_barrier_is_serious(window: WindowProcess) -> None:
             page.set_viewport_size({"width": width, "height": 844})
             for place in ("experiments", "runs", "fish", "live"):
                 go(page, place)
+                if place == "experiments":
+                    page.click("#tab-optimise")
+                    page.locator("#experiment details").evaluate("node => node.open = true")
                 refuse_barriers(page)
         show_chart_tools(page)
         refuse_barriers(page)
@@ -611,17 +662,19 @@ def test_a_queue_is_filled_ordered_started_and_stopped_without_a_mouse(
         go(page, "experiments")
         queue, queued = page.locator(".queue"), page.locator(".queued code")
         expect(queue).to_contain_text("Empty")
-        for count, seconds in enumerate(("21", "60", "45")):
-            page.get_by_label("Seconds").fill(seconds)
-            page.get_by_role("button", name="Add to queue").press("Enter")
+        for count, seconds in enumerate(("21", "50", "45")):
+            page.fill("#option-seconds", seconds)
+            add = page.get_by_role("button", name="Add to queue")
+            expect(add).to_be_enabled()
+            add.press("Enter")
             expect(queued).to_have_count(count + 1)
-        page.get_by_role("button", name="Move up measure swing --for 45").press("Enter")
-        expect(queued.nth(1)).to_have_text("fishctl measure swing --for 45")
-        runs = page.get_by_label("Runs of measure swing --for 60")
+        page.get_by_role("button", name="Move up measure swing --for 45 --on=live").press("Enter")
+        expect(queued.nth(1)).to_have_text("fishctl measure swing --for 45 --on=live")
+        runs = page.get_by_label("Runs of measure swing --for 50 --on=live")
         runs.fill("3")
         runs.press("Tab")
         expect(queue).to_contain_text("3 in it, about 4\N{NO-BREAK SPACE}min")
-        page.get_by_role("button", name="Remove measure swing --for 21").press("Enter")
+        page.get_by_role("button", name="Remove measure swing --for 21 --on=live").press("Enter")
         expect(queued).to_have_count(2)
         stop_at = page.get_by_label("Stop at")
         stop_at.fill("6 pm")

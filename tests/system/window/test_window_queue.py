@@ -46,7 +46,7 @@ async def test_a_page_and_a_terminal_change_the_same_queue(
     async with Browser(new_window.url) as browser, open_page(browser) as page:
         assert (await browser.get(QUEUE))["state"] == "empty"
         view = await add(page, repeat=3)
-        assert view["items"][0]["words"] == ["measure", "square", "--for", "60"]
+        assert view["items"][0]["words"] == ["measure", "square", "--on=live"]
         assert (view["state"], view["left"]) == ("paused", 180.0)
         terminal(new_window, daemon, "add", "sweep", "sine", "frequency=1,2")
         view = await page.post("queue", {"op": "move", "number": 2, "position": 1})
@@ -124,7 +124,7 @@ async def test_a_queue_whose_window_is_killed_waits_for_a_start_in_the_next_one(
             assert view["items"][0]["run"]
             (lost,) = page.hello["jobs"]
             assert lost["state"] == "lost"
-            assert lost["lines"][-1].endswith("the queue waits for a start")
+            assert lost["lines"][-1].endswith("start it again")
     assert daemon.status().mode == "idle"
 
 
@@ -140,13 +140,13 @@ async def test_a_queue_whose_window_is_killed_waits_for_a_start_in_the_next_one(
         ({"op": "repeat", "number": 1, "repeat": 10**6}, 400, "bad-arguments"),
         ({"op": "pause", "at": -1}, 400, "bad-arguments"),
         ({"op": "clear", "words": ["record"]}, 400, "bad-arguments"),
-        ({**MEASURE, "kind": "record"}, 400, "unknown-kind"),
+        ({"op": "add", "kind": "record"}, 400, "unknown-kind"),
         ({**MEASURE, "kind": "resume"}, 400, "unknown-kind"),
         ({**MEASURE, "kind": "queue"}, 400, "unknown-kind"),
         ({**MEASURE, "kind": "../above"}, 400, "unknown-kind"),
         ({**MEASURE, "repeat": 0}, 400, "bad-arguments"),
         ({**MEASURE, "options": {"controller": "--help"}}, 400, "bad-arguments"),
-        ({**MEASURE, "options": {"controller": "square", "seconds": 3}}, 400, "bad-arguments"),
+        ({**MEASURE, "options": {"controller": "square", "seconds": 3}}, 409, "job"),
         ({**MEASURE, "options": {"controller": "square", "take": True}}, 409, "job"),
         (
             {**MEASURE, "options": {"controller": "square", "parameters": {"frequency": 99}}},
