@@ -18,6 +18,7 @@ from fishd.core import files, text
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import ConfigError, FishError
 from fishd.core.experiment_queue import MAX_PAST, Item, Outcome, Past, Queue, QueueError, QueueFile
+from fishd.core.experiments import PROGRESS_PREFIX
 from fishd.core.process.interruption import SIGNALS, handle_signals
 from fishd.lab.experiment import Header, find_answer, read_header
 from fishd.window.children import fishctl_command
@@ -165,7 +166,8 @@ class QueueRunner:
     def _read_lines(self, child: "subprocess.Popen[str]") -> None:
         assert child.stderr
         for line in child.stderr:
-            self._last_line = text.line(line).removeprefix("fishctl: ")
+            if not line.startswith(PROGRESS_PREFIX.decode()):  # which is for a page
+                self._last_line = text.line(line).removeprefix("fishctl: ")
             with suppress(OSError):  # the terminal is gone; the run goes on
                 echo(line.rstrip(), err=True)
 
