@@ -154,6 +154,10 @@ def _print_learned(state: "CameraState", as_json: bool) -> None:
         [
             ("learned", f"{state.tail_learned}, from pictures of {size}"),
             ("zero", f"± {zero_ci95 * 1e3:.1f} mrad"),
+            *(
+                [("lens", f"{state.lens}; calibrate again if the camera was moved")]
+                * bool(state.lens)
+            ),
         ]
     )
     if zero_ci95 > MAX_ZERO_CI95_RAD:
