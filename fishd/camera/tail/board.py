@@ -94,13 +94,12 @@ class View(NamedTuple):
 
 def find_board(picture: Pixels) -> View | str:
     """Return the corners of the board in a picture, or why there are too few."""
-    points, numbers, _, markers = _detector.detectBoard(picture)
+    points, numbers, _, _ = _detector.detectBoard(picture)
     count = 0 if numbers is None else len(numbers)
-    if count >= _MIN_CORNERS:
-        return View(numbers.ravel().astype(np.int64), points.reshape(-1, 2).astype(np.float64))
-    if markers is None:
-        return "no board is seen: it must be near, sharp and evenly lit"
-    return f"only {count} corners of the board are seen: it must be nearer, sharp and less cut off"
+    if count < _MIN_CORNERS:
+        all_of = f"{count} of {len(_corners)} corners of the board are seen"
+        return f"{all_of}: it must be near, sharp, evenly lit and in the picture"
+    return View(numbers.ravel().astype(np.int64), points.reshape(-1, 2).astype(np.float64))
 
 
 class BoardWatch:
@@ -173,11 +172,11 @@ class BoardWatch:
             error, matrix, radial, spread, errors = _calibrate(views, self.size)
             used = errors <= _OUTLIER * np.median(errors)
             views = [view for view, is_used in zip(views, used, strict=True) if is_used]
+        _check_error(error, self.size, "any lens", "take sharp pictures, with a usual lens")
         if not spread[:2].max() < _MAX_FOCAL_ERROR * matrix[0, 0]:
             raise CannotLearn(
                 f"the {len(errors)} views are too similar: slant the board more, to all sides"
             )
-        _check_error(error, self.size, "any lens", "take sharp pictures, with a usual lens")
         return Lens(
             date=_now(),
             size=self.size,
