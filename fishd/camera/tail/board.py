@@ -135,16 +135,13 @@ class BoardWatch:
         if isinstance(view, str):
             self.problem = view
             return False
-        points = (view.points + 0.5) * np.divide(self.size, size) - 0.5
-        view = view._replace(points=points)
-        self.problem = ""
+        view = view._replace(points=(view.points + 0.5) * np.divide(self.size, size) - 0.5)
+        is_still = time is None
         if time is not None:
             self._last = time, view
             is_next = before is not None and 0.0 < time - before[0] < _STILL_S
-            if before is None or not is_next or view.distance(before[1]) > _STILL_PX:
-                self.problem = "hold the board still"
-        if not self.problem:
-            self.problem = self._find_problem(view, self.size)
+            is_still = is_next and before is not None and view.distance(before[1]) < _STILL_PX
+        self.problem = self._find_problem(view, self.size) if is_still else "hold the board still"
         if not self.problem:
             self.views.append(view)
         return not self.problem
@@ -221,11 +218,9 @@ class PlaneWatch(BoardWatch):
         _check_error(error, self.size, "a plane", "lay the board flat, without waves above it")
         # In the middle of the picture, the plane's pixels have its scale and its directions.
         middle = 0.5 * (np.array(self.size) - 1.0)
-        near = middle + np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5], [-0.5, 0.0], [0.0, -0.5]])
-        place, right, down, left, up = cv2.perspectiveTransform(
-            lens.straighten(near[:, None]), matrix
-        )[:, 0]
-        u, sizes, v = np.linalg.svd(np.stack([right - left, down - up], axis=1))
+        near = lens.straighten(np.add(middle, [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, None])
+        place, right, down = cv2.perspectiveTransform(near, matrix)[:, 0]
+        u, sizes, v = np.linalg.svd(np.stack([right - place, down - place], axis=1))
         scale = float(np.sqrt(sizes.prod()))
         even = np.eye(3)
         even[:2, :2] = (u @ v).T / scale

@@ -56,6 +56,13 @@ class Lens(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     distortion: Annotated[tuple[float, float], note("Radial distortion: k₁ and k₂.")]
     plane: Annotated[Plane | None, note("Plane of the tail; null: that of the picture.")] = None
 
+    def __post_init__(self) -> None:
+        """Raise ValueError for values that no camera has."""
+        if min(*self.size, *self.focal) <= 0.0:
+            raise ValueError("size or focal length")
+        if self.plane and np.linalg.det(np.reshape(self.plane.matrix, (3, 3))) <= 0.0:
+            raise ValueError("plane")
+
     @property
     def pixels_per_mm(self) -> float | None:
         """Scale in the plane of the tail [px/mm]; None if it is unknown."""
@@ -113,19 +120,10 @@ class Lens(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         """Return what a file contains; raise `CannotUseLens`."""
         shown = text.quoted(str(path))
         try:
-            lens = msgspec.json.decode(files.read(path, _MAX_BYTES, "a lens"), type=cls)
-            lens._check()
+            return msgspec.json.decode(files.read(path, _MAX_BYTES, "a lens"), type=cls)
         except files.FileProblem as problem:
             raise CannotUseLens(f"{shown}: {problem}") from None
-        except (msgspec.DecodeError, UnicodeError, ValueError):
+        except (msgspec.DecodeError, UnicodeError):
             raise CannotUseLens(
                 f"{shown} contains no calibration of a lens: calibrate again"
             ) from None
-        return lens
-
-    def _check(self) -> None:
-        """Raise ValueError for values that no camera has."""
-        if min(*self.size, *self.focal) <= 0.0:
-            raise ValueError("size or focal length")
-        if self.plane and np.linalg.det(np.reshape(self.plane.matrix, (3, 3))) <= 0.0:
-            raise ValueError("plane")

@@ -52,10 +52,10 @@ def test_lens_and_plane_are_calibrated_one_after_the_other(folder: Path) -> None
             "plane of the tail 0."
             in fishctl("camera", "status", "--camera", camera.endpoint).stdout
         )
-    found = Lens.load(folder / "tail.lens.json")
-    assert found.size == (480, 360)
-    assert found.focal == pytest.approx((480.0, 480.0), rel=0.01)
-    assert found.pixels_per_mm == pytest.approx(0.08 * 480 / SQUARE_MM, rel=0.01)
+    calibration = Lens.load(folder / "tail.lens.json")
+    assert calibration.size == (480, 360)
+    assert calibration.focal == pytest.approx((480.0, 480.0), rel=0.01)
+    assert calibration.pixels_per_mm == pytest.approx(0.08 * 480 / SQUARE_MM, rel=0.01)
 
 
 def test_a_camera_without_views_is_not_calibrated(folder: Path, tmp_path: Path) -> None:

@@ -258,18 +258,26 @@ def test_the_printed_board_has_its_true_size() -> None:
 
 
 @pytest.mark.parametrize(
-    "content", ["", "nonsense", "{}", '{"focal": [0, 0]}', "focal", "plane", "\xff\xfe"]
+    "change",
+    [
+        lambda content: content[:-9],
+        lambda content: b"\xff\xfe" + content,
+        lambda content: b"{}",
+        lambda content: re.sub(rb'"focal": \[\s*[\d.]+', b'"focal": [0.0', content),
+        lambda content: re.sub(
+            rb'"matrix": \[[^]]*\]', b'"matrix": ' + b"[" + 8 * b"0," + b"0]", content
+        ),
+    ],
+    ids=["torn", "no text", "another", "no focal length", "no plane"],
 )
-def test_a_file_that_is_no_calibration_is_refused(lens: Lens, tmp_path: Path, content: str) -> None:
+def test_a_file_that_is_no_calibration_is_refused(
+    lens: Lens, tmp_path: Path, change: Callable[[bytes], bytes]
+) -> None:
     path = tmp_path / "lens.json"
     lens.save(path)
     assert Lens.load(path) == lens
-    assert lens.plane
-    if content == "focal":
-        changed(lens, focal=(0.0, 0.0)).save(path)
-    elif content == "plane":
-        changed(lens, plane=changed(lens.plane, matrix=9 * (0.0,))).save(path)
-    else:
-        path.write_text(content, encoding="latin-1")
+    before = path.read_bytes()
+    path.write_bytes(change(before))
+    assert path.read_bytes() != before
     with pytest.raises(CannotUseLens, match=r"lens.json contains no calibration of a lens"):
         Lens.load(path)
