@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from fishd.camera.tail.board import COLUMNS, MODULES, ROWS, BoardWatch, PlaneWatch, draw_board
 from fishd.camera.tail.lens import Lens
-from rigs.filmed_tail import SAMPLES, Film, Floats
+from rigs.filmed_tail import Film, Floats
 
 _FINE = 8
 """Pixels of the drawn board along a module."""
+_SAMPLES = 3
+"""Samples per pixel along both directions."""
 _MARGIN = 2
 """White modules around it."""
 SQUARE_MM = 25.0
@@ -24,9 +26,8 @@ class FilmedBoard:
 
     def __init__(self, film: Film) -> None:
         self.film = film
-        w, h = film.width, film.height
         self._random = np.random.default_rng(film.seed + 7)
-        self._centre = np.array([0.5 * (w - 1), 0.5 * (h - 1)])
+        self._centre = 0.5 * (np.array([film.width, film.height]) - 1.0)
         drawn = cv2.copyMakeBorder(
             draw_board(),
             *[_MARGIN] * 4,
@@ -40,15 +41,14 @@ class FilmedBoard:
 
     def _straighten(self) -> Floats:
         """Return where each sample of the picture is seen by an ideal camera, from its centre."""
-        w, h = self.film.width, self.film.height
-        samples = np.meshgrid(np.arange(w * SAMPLES), np.arange(h * SAMPLES))
-        seen = (np.stack(samples, axis=2) + 0.5) / SAMPLES - 0.5 - self._centre
-        seen *= (1.0, self.film.aspect)
+        film = self.film
+        pixels = np.meshgrid(np.arange(film.width), np.arange(film.height))
+        seen = (np.stack(pixels, axis=2) - self._centre) * (1.0, film.aspect)
         ideal = seen
         for _ in range(20):
             radius = np.linalg.norm(ideal, axis=2, keepdims=True) / math.hypot(*self._centre)
-            ideal = seen / (1.0 + self.film.lens * radius**2)
-        return ideal
+            ideal = seen / (1.0 + film.lens * radius**2)
+        return np.asarray(cv2.resize(ideal, None, fx=_SAMPLES, fy=_SAMPLES))
 
     def picture(
         self, square: float, place: Floats, rotation: Floats, blur: float = 0.0

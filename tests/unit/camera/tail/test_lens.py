@@ -135,7 +135,7 @@ def blurred(board: FilmedBoard) -> Pictures:
 
 
 def far(board: FilmedBoard) -> Pictures:
-    return [board.picture(0.018, np.zeros(3), np.eye(3))]
+    return [board.picture(0.012, np.zeros(3), np.eye(3))]
 
 
 def empty(board: FilmedBoard) -> Pictures:
