@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import Any
 
+import msgspec
 import zmq
 from msgspec import Struct
 
 from fishd.camera.messages import STATE, VIEW
 from fishd.core import addresses, protocol, text
 from fishd.core.errors import Refused
-from fishd.core.schema import Problem, convert, suggest
+from fishd.core.schema import suggest
 from fishd.core.socket_file import SocketFile
 
 MAX_QUEUED_MESSAGES = 256
@@ -110,10 +111,10 @@ class Requests:
             kind = self.arguments.get(request.op)
             if request.args and kind is None:
                 raise Refused("bad-arguments", f"{request.op} takes no arguments")
-            values = () if kind is None else (convert(request.args, kind),)
+            values = () if kind is None else (msgspec.convert(request.args, kind),)
             return protocol.success(request.id, self.operations[request.op](*values))
-        except Problem as problem:
-            refusal = Refused("bad-arguments", problem.message_with_place({}))
+        except msgspec.ValidationError as error:
+            refusal = Refused("bad-arguments", text.line(str(error)))
             return protocol.failure(protocol.request_id(payload), refusal)
         except Refused as error:
             return protocol.failure(protocol.request_id(payload), error)

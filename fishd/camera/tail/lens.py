@@ -59,9 +59,9 @@ class Lens(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     def __post_init__(self) -> None:
         """Raise ValueError for values that no camera has."""
         if min(*self.size, *self.focal) <= 0.0:
-            raise ValueError("size or focal length")
+            raise ValueError("size and focal length must be positive")
         if self.plane and np.linalg.det(np.reshape(self.plane.matrix, (3, 3))) <= 0.0:
-            raise ValueError("plane")
+            raise ValueError("the map to the plane must not turn it over")
 
     @property
     def pixels_per_mm(self) -> float | None:

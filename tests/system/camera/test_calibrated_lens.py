@@ -4,14 +4,17 @@ import re
 import subprocess
 from pathlib import Path
 
+import msgspec
 import pytest
 from rigs.camera_process import running_camera
-from rigs.filmed_board import SQUARE_MM, FilmedBoard
+from rigs.filmed_board import SQUARE_MM, FilmedBoard, calibrate
 from rigs.filmed_tail import Film
 from rigs.filmed_video import write_video
 from rigs.processes import fishctl, one_line
 
+from fishd.camera.messages import CameraState
 from fishd.camera.tail.lens import Lens
+from fishd.core.errors import Refused
 
 pytestmark = pytest.mark.slow
 FILM = Film(width=480, height=360, lens=-0.12, tilt=0.1)
@@ -64,3 +67,20 @@ def test_a_camera_without_views_is_not_calibrated(folder: Path, tmp_path: Path) 
         camera.is_in("streaming")
         refused = one_line(lens(camera.endpoint))
         assert "set publish.view_rate of the camera to 2 or more" in refused
+
+
+def test_a_calibration_that_no_camera_has_is_refused(folder: Path, tmp_path: Path) -> None:
+    whole = msgspec.to_builtins(calibrate(FILM))
+    settings = ("source=stream", f"stream.url={folder}/lying.avi")
+    with running_camera(tmp_path, *settings) as camera, camera.client() as client:
+        for change, message in (
+            ({"focal": [0.0, 480.0]}, "size and focal length must be positive"),
+            ({"date": None}, "Expected `str`, got `null`"),
+            (
+                {"rotate": 90},
+                "turned by 0°, but the lens was calibrated with pictures turned by 90",
+            ),
+        ):
+            with pytest.raises(Refused, match=message):
+                client.requests._call(CameraState, "set_lens", args=whole | change)
+        assert client.status().lens == ""
