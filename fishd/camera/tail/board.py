@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from fishd.camera.tail.learner import CannotLearn
-from fishd.camera.tail.lens import Array, Lens, Plane, Turn
+from fishd.camera.tail.lens import Array, Lens, Turn
 from fishd.core.camera_frames import Pixels
 
 COLUMNS, ROWS = 9, 6
@@ -225,13 +225,13 @@ class PlaneWatch(BoardWatch):
         even = np.eye(3)
         even[:2, :2] = (u @ v).T / scale
         even[:2, 2] = middle - even[:2, :2] @ place
-        plane = Plane(
+        return replace(
+            lens,
             date=_now(),
-            error=error,
-            matrix=tuple((even @ matrix).ravel().tolist()),
+            plane=tuple((even @ matrix).ravel().tolist()),
+            plane_error=error,
             pixels_per_mm=1.0 / (scale * self._square_mm) if self._square_mm else None,
         )
-        return replace(lens, plane=plane)
 
 
 def _calibrate(

@@ -121,15 +121,11 @@ class Learned(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return pose.in_plane(self.lens).to_axis(self.lens.to_plane(places))
 
     def check_lens(self, lens: Lens | None) -> None:
-        """Raise `CannotUse` if the tail was learned with another lens."""
+        """Raise `CannotUse` if the tail was learned with another calibration, or without one."""
         if self.lens != lens:
-            before, now = (
-                f"with that {each.describe()}" if each else "without one"
-                for each in (self.lens, lens)
-            )
             raise CannotUse(
-                f"another calibration of the lens: the tail was learned {before}, and is measured "
-                f"{now}: learn again"
+                "the tail was learned without this calibration of the lens, or with another: learn "
+                "again"
             )
 
     def check_size(self, width: int, height: int) -> None:

@@ -25,24 +25,6 @@ class CannotUseLens(FishdError, ValueError):
     """A calibration cannot be read or written, or is not that of these pictures."""
 
 
-class Plane(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """View of the plane in which the tail swings."""
-
-    date: Annotated[str, note("Date and time of the picture of the board, ISO 8601.")]
-    error: Annotated[float, unit("px", "Error of the corners in it, root mean square.", ge=0)]
-    matrix: Annotated[
-        tuple[float, ...],
-        note(
-            "Projective map, row by row, from a picture without distortion to the plane [px].",
-            min_length=9,
-            max_length=9,
-        ),
-    ]
-    pixels_per_mm: Annotated[
-        float | None, unit("px/mm", "Scale in the plane; null if the board's is unknown.")
-    ] = None
-
-
 class Lens(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Lens of turned whole pictures; distortion is radial, as OpenCV defines it."""
 
@@ -54,19 +36,27 @@ class Lens(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     focal: Annotated[tuple[float, float], unit("px", "Focal length along rows and columns.")]
     centre: Annotated[tuple[float, float], unit("px", "Column and row of the optical axis.")]
     distortion: Annotated[tuple[float, float], note("Radial distortion: k₁ and k₂.")]
-    plane: Annotated[Plane | None, note("Plane of the tail; null: that of the picture.")] = None
+    plane: Annotated[
+        tuple[float, ...],
+        note(
+            "Map from a picture without distortion to the plane of the tail, row by row [px].",
+            min_length=9,
+            max_length=9,
+        ),
+    ] = _IDENTITY
+    plane_error: Annotated[
+        float | None, unit("px", "Error of the corners in that plane; null: it is not calibrated.")
+    ] = None
+    pixels_per_mm: Annotated[
+        float | None, unit("px/mm", "Scale in that plane; null if it is unknown.")
+    ] = None
 
     def __post_init__(self) -> None:
         """Raise ValueError for values that no camera has."""
         if min(*self.size, *self.focal) <= 0.0:
             raise ValueError("size and focal length must be positive")
-        if self.plane and np.linalg.det(np.reshape(self.plane.matrix, (3, 3))) <= 0.0:
+        if np.linalg.det(np.reshape(self.plane, (3, 3))) <= 0.0:
             raise ValueError("the map to the plane must not turn it over")
-
-    @property
-    def pixels_per_mm(self) -> float | None:
-        """Scale in the plane of the tail [px/mm]; None if it is unknown."""
-        return self.plane.pixels_per_mm if self.plane else None
 
     def to_plane(self, points: Array, factor: float = 1.0) -> Array:
         """Return where points of a picture lie in the plane of the tail, shape (…, 2) [px].
@@ -76,7 +66,7 @@ class Lens(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         factor: width of the picture that was calibrated, in widths of the picture
         """
         whole = (np.reshape(points, (-1, 1, 2)) + 0.5) * factor - 0.5
-        straight = self.straighten(whole, self.plane.matrix if self.plane else _IDENTITY)
+        straight = self.straighten(whole, self.plane)
         return np.asarray((straight.reshape(np.shape(points)) + 0.5) / factor - 0.5)
 
     def straighten(self, points: Array, matrix: tuple[float, ...] = _IDENTITY) -> Array:
@@ -105,7 +95,8 @@ class Lens(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     def describe(self) -> str:
         """Return its date and errors in one line."""
-        plane = f", plane of the tail {self.plane.error:.2f} px" if self.plane else ""
+        error = self.plane_error
+        plane = "" if error is None else f", plane of the tail {error:.2f} px"
         return f"calibrated {self.date}, error {self.error:.2f} px{plane}"
 
     def save(self, path: Path, *, new: bool = False) -> None:

@@ -91,7 +91,8 @@ def lens(
     if not plane:
         echo("lay the board flat at the depth of the tail, and give the same command with --plane")
     else:
-        echo("learn the tail with this calibration: fishctl camera measure --learn")
+        measure = f"VIDEO --lens {target}" if target else "--learn"
+        echo(f"learn the tail with this calibration: fishctl camera measure {measure}")
     return 0
 
 

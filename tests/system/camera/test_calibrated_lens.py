@@ -1,6 +1,7 @@
 """Calibration of the lens of a real fishd-camera, before which a board is held."""
 
 import re
+import signal
 import subprocess
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from rigs.camera_process import running_camera
 from rigs.filmed_board import SQUARE_MM, FilmedBoard, calibrate
 from rigs.filmed_tail import Film
 from rigs.filmed_video import write_video
-from rigs.processes import fishctl, one_line
+from rigs.processes import FISHCTL, Process, fishctl, one_line
 
 from fishd.camera.messages import CameraState
 from fishd.camera.tail.lens import Lens
@@ -61,6 +62,18 @@ def test_lens_and_plane_are_calibrated_one_after_the_other(folder: Path) -> None
     assert calibration.pixels_per_mm == pytest.approx(0.08 * 480 / SQUARE_MM, rel=0.01)
 
 
+def test_an_interrupted_calibration_changes_nothing(folder: Path, tmp_path: Path) -> None:
+    settings = ("source=stream", f"stream.url={folder}/lying.avi", f"tail.learned={tmp_path}/t.bin")
+    with running_camera(tmp_path, *settings) as camera:
+        camera.is_in("streaming")
+        with Process(FISHCTL, "camera", "lens", "--camera", camera.endpoint) as process:
+            assert process.process.stderr
+            assert "1 views, at least 10 are needed" in process.process.stderr.readline()
+            status, _, said = process.end(signal.SIGINT)
+        assert (status, camera.status().lens) == (130, "")
+        assert "interrupted: nothing is calibrated" in said
+
+
 def test_a_camera_without_views_is_not_calibrated(folder: Path, tmp_path: Path) -> None:
     settings = ("source=stream", f"stream.url={folder}/lying.avi", "publish.view_rate=0")
     with running_camera(tmp_path, *settings) as camera:
@@ -71,7 +84,7 @@ def test_a_camera_without_views_is_not_calibrated(folder: Path, tmp_path: Path) 
 
 def test_a_calibration_that_no_camera_has_is_refused(folder: Path, tmp_path: Path) -> None:
     whole = msgspec.to_builtins(calibrate(FILM))
-    settings = ("source=stream", f"stream.url={folder}/lying.avi")
+    settings = ("source=stream", f"stream.url={folder}/lying.avi", f"tail.learned={tmp_path}/t.bin")
     with running_camera(tmp_path, *settings) as camera, camera.client() as client:
         for change, message in (
             ({"focal": [0.0, 480.0]}, "size and focal length must be positive"),
