@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.camera.tail.board import COLUMNS, MODULES, ROWS, BoardWatch, PlaneWatch, draw_board
+from fishd.camera.tail.board import COLUMNS, MODULES, ROWS, BoardWatch, draw_board, find_plane
 from fishd.camera.tail.lens import Lens
 from rigs.filmed_tail import Film, Floats
 
@@ -109,6 +109,6 @@ def calibrate(film: Film) -> Lens:
     views = BoardWatch(0)
     for picture in board.held():
         views.add(None, picture)
-    plane = PlaneWatch(views.calibrate(), SQUARE_MM)
+    plane = BoardWatch(0)
     plane.add(None, board.lying())
-    return plane.calibrate()
+    return find_plane(views.calibrate(), plane, SQUARE_MM)

@@ -110,7 +110,7 @@ class BoardWatch:
         rotate: clockwise turn of the pictures [degrees]
         size: that of whole pictures, of which smaller ones are added; None: that of the first [px]
         """
-        self._rotate, self.size = rotate, size
+        self.rotate, self.size = rotate, size
         self._is_scaled = size is not None
         self._last: tuple[float, View] | None = None
         self.views: list[View] = []
@@ -141,15 +141,13 @@ class BoardWatch:
             self._last = time, view
             is_next = before is not None and 0.0 < time - before[0] < _STILL_S
             is_still = is_next and before is not None and view.distance(before[1]) < _STILL_PX
-        self.problem = self._find_problem(view, self.size) if is_still else "hold the board still"
+        near = min(map(view.distance, self.views), default=np.inf) < _NEW_VIEW * self.size[0]
+        self.problem = "this view was taken: move the board" if near else ""
+        if not is_still:
+            self.problem = "hold the board still"
         if not self.problem:
             self.views.append(view)
         return not self.problem
-
-    def _find_problem(self, view: View, size: tuple[int, int]) -> str:
-        """Return why a view is not taken."""
-        near = min(map(view.distance, self.views), default=np.inf)
-        return "this view was taken: move the board" if near < _NEW_VIEW * size[0] else ""
 
     def calibrate(self) -> Lens:
         """Return the lens; raise `CannotLearn` with what the board has to show for that."""
@@ -169,7 +167,7 @@ class BoardWatch:
             error, matrix, radial, spread, errors = _calibrate(views, self.size)
             used = errors <= _OUTLIER * np.median(errors)
             views = [view for view, is_used in zip(views, used, strict=True) if is_used]
-        _check_error(error, self.size, "any lens", "take sharp pictures, with a usual lens")
+        _check_error(error, self.size[0], "any lens", "take sharp pictures, with a usual lens")
         if not spread[:2].max() < _MAX_FOCAL_ERROR * matrix[0, 0]:
             raise CannotLearn(
                 f"the {len(errors)} views are too similar: slant the board more, to all sides"
@@ -177,7 +175,7 @@ class BoardWatch:
         return Lens(
             date=_now(),
             size=self.size,
-            rotate=self._rotate,
+            rotate=self.rotate,
             views=len(errors),
             error=error,
             focal=(float(matrix[0, 0]), float(matrix[1, 1])),
@@ -186,52 +184,41 @@ class BoardWatch:
         )
 
 
-class PlaneWatch(BoardWatch):
-    """Collector of a picture of the board in the plane of the tail."""
+def find_plane(lens: Lens, watch: BoardWatch, square_mm: float | None) -> Lens:
+    """Return the lens with the plane of the tail, in which the board of the latest view lies.
 
-    def __init__(
-        self, lens: Lens, square_mm: float | None, size: tuple[int, int] | None = None
-    ) -> None:
-        """
-        square_mm: side of a square [mm]; None if it is unknown
-        size: as for `BoardWatch`
-        """
-        super().__init__(lens.rotate, size)
-        self._lens, self._square_mm = lens, square_mm
-
-    def _find_problem(self, view: View, size: tuple[int, int]) -> str:
-        area = cv2.contourArea(cv2.convexHull(view.points.astype(np.float32)))
-        is_small = area < _MIN_AREA * size[0] * size[1]
-        return "the board is too small in the picture: print a larger one" if is_small else ""
-
-    def calibrate(self) -> Lens:
-        """Return the lens with the plane; raise `CannotLearn`, `CannotUseLens`."""
-        if not self.views or self.size is None:
-            raise CannotLearn(self.problem)
-        lens, view = self._lens, self.views[-1]
-        lens.check(self.size, self._rotate)
-        squares = _corners[view.numbers]
-        straight = lens.straighten(view.points[:, None])[:, 0]
-        matrix, _ = cv2.findHomography(straight, squares)
-        there = cv2.perspectiveTransform(squares[:, None], np.linalg.inv(matrix))[:, 0]
-        error = float(np.sqrt(np.mean(np.sum((there - straight) ** 2, axis=1))))
-        _check_error(error, self.size, "a plane", "lay the board flat, without waves above it")
-        # In the middle of the picture, the plane's pixels have its scale and its directions.
-        middle = 0.5 * (np.array(self.size) - 1.0)
-        near = lens.straighten(np.add(middle, [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, None])
-        place, right, down = cv2.perspectiveTransform(near, matrix)[:, 0]
-        u, sizes, v = np.linalg.svd(np.stack([right - place, down - place], axis=1))
-        scale = float(np.sqrt(sizes.prod()))
-        even = np.eye(3)
-        even[:2, :2] = (u @ v).T / scale
-        even[:2, 2] = middle - even[:2, :2] @ place
-        return replace(
-            lens,
-            date=_now(),
-            plane=tuple((even @ matrix).ravel().tolist()),
-            plane_error=error,
-            pixels_per_mm=1.0 / (scale * self._square_mm) if self._square_mm else None,
-        )
+    square_mm: side of a square [mm]; None if it is unknown
+    Raise `CannotLearn` and `CannotUseLens`.
+    """
+    if not watch.views or watch.size is None:
+        raise CannotLearn(watch.problem)
+    (width, height), view = watch.size, watch.views[-1]
+    lens.check(watch.size, watch.rotate)
+    area = cv2.contourArea(cv2.convexHull(view.points.astype(np.float32)))
+    if area < _MIN_AREA * width * height:
+        raise CannotLearn("the board is too small in the picture: print a larger one")
+    squares = _corners[view.numbers]
+    straight = lens.straighten(view.points[:, None])[:, 0]
+    matrix, _ = cv2.findHomography(straight, squares)
+    there = cv2.perspectiveTransform(squares[:, None], np.linalg.inv(matrix))[:, 0]
+    error = float(np.sqrt(np.mean(np.sum((there - straight) ** 2, axis=1))))
+    _check_error(error, width, "a plane", "lay the board flat, without waves above it")
+    # In the middle of the picture, the plane's pixels have its scale and its directions.
+    middle = 0.5 * (np.array([width, height]) - 1.0)
+    near = lens.straighten(np.add(middle, [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, None])
+    place, right, down = cv2.perspectiveTransform(near, matrix)[:, 0]
+    u, sizes, v = np.linalg.svd(np.stack([right - place, down - place], axis=1))
+    scale = float(np.sqrt(sizes.prod()))
+    even = np.eye(3)
+    even[:2, :2] = (u @ v).T / scale
+    even[:2, 2] = middle - even[:2, :2] @ place
+    return replace(
+        lens,
+        date=_now(),
+        plane=tuple((even @ matrix).ravel().tolist()),
+        plane_error=error,
+        pixels_per_mm=1.0 / (scale * square_mm) if square_mm else None,
+    )
 
 
 def _calibrate(
@@ -252,9 +239,9 @@ def _calibrate(
     return float(error), matrix, radial.ravel(), spread.ravel(), errors.ravel()
 
 
-def _check_error(error: float, size: tuple[int, int], model: str, remedy: str) -> None:
-    """Raise `CannotLearn` for an error [px] that is too large for the size of a picture."""
-    if error > _MAX_ERROR * size[0]:
+def _check_error(error: float, width: int, model: str, remedy: str) -> None:
+    """Raise `CannotLearn` for an error that is too large for the picture's width [px]."""
+    if error > _MAX_ERROR * width:
         raise CannotLearn(f"the corners are {error:.1f} px beside those of {model}: {remedy}")
 
 

@@ -1,6 +1,7 @@
 """The verb that calibrates the lens of a camera, and its view of the plane of the tail."""
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -116,7 +117,7 @@ def _calibrate_live(address: str | None, plane: bool, square_mm: float | None) -
     """Calibrate with the pictures of a camera until they are sufficient, and store the result."""
     from fishd.camera.client import CameraClient
     from fishd.camera.drawing import decode_view
-    from fishd.camera.tail.board import MIN_VIEWS, BoardWatch, PlaneWatch
+    from fishd.camera.tail.board import MIN_VIEWS, BoardWatch, find_plane
     from fishd.camera.tail.learner import CannotLearn
 
     with CameraClient(address, views=True) as client:
@@ -128,15 +129,16 @@ def _calibrate_live(address: str | None, plane: bool, square_mm: float | None) -
         state, turn = client.status(), settings.picture.rotate
         size = state.picture_width, state.picture_height
         watch = BoardWatch(turn, size)
+        calibrate = watch.calibrate
         if plane:
             lens = client.requests.lens()
             lens.check(size, turn)
-            watch = PlaneWatch(lens, square_mm, size)
+            calibrate = partial(find_plane, lens, watch, square_mm)
         with show_progress(1 if plane else MIN_VIEWS, "views", err=True) as bar:
             for view in views:
                 if watch.add(view.header.time, decode_view(view)[..., 0]):
                     try:
-                        result = watch.calibrate()
+                        result = calibrate()
                     except CannotLearn as missing:
                         bar.done(f"fishctl: {missing}", len(watch.views))
                     else:
@@ -153,16 +155,16 @@ def _calibrate_from_files(
     plane: bool,
     square_mm: float | None,
 ) -> "Lens":
-    from fishd.camera.tail.board import BoardWatch, PlaneWatch
+    from fishd.camera.tail.board import BoardWatch, find_plane
     from fishd.camera.tail.lens import Lens
 
-    watch = BoardWatch(turn or 0)
-    if plane:
-        lens = Lens.load(target)
-        lens.check(lens.size, lens.rotate if turn is None else turn)
-        watch, turn = PlaneWatch(lens, square_mm), lens.rotate
+    lens = Lens.load(target) if plane else None
+    if lens:
+        turn = lens.rotate if turn is None else turn
+        lens.check(lens.size, turn)
     elif target.exists():
         raise FishdError(f"{target} exists already: give another file with --to")
+    watch = BoardWatch(turn or 0)
     with show_progress(len(paths), "files", err=True) as bar:
         for number, path in enumerate(paths):
             before = len(watch.views)
@@ -171,7 +173,7 @@ def _calibrate_from_files(
             if len(watch.views) == before:
                 bar.warn(f"fishctl: {text.quoted(str(path))}: {watch.problem}")
             bar.at(number + 1)
-    result = watch.calibrate()
+    result = find_plane(lens, watch, square_mm) if lens else watch.calibrate()
     result.save(target, new=not plane)
     return result
 

@@ -18,10 +18,10 @@ from fishd.camera.tail.board import (
     COLUMNS,
     MIN_VIEWS,
     BoardWatch,
-    PlaneWatch,
     draw_board,
     draw_svg,
     find_board,
+    find_plane,
 )
 from fishd.camera.tail.learned import CannotUse
 from fishd.camera.tail.learner import CannotLearn, Learner
@@ -216,10 +216,10 @@ def test_corners_that_fit_no_lens_are_refused() -> None:
 def test_a_picture_that_shows_no_plane_is_named(
     lens: Lens, picture: Callable[[FilmedBoard], NDArray[np.uint8]], message: str
 ) -> None:
-    watch = PlaneWatch(lens, None)
+    watch = BoardWatch(0)
     watch.add(None, picture(FilmedBoard(FILM)))
     with pytest.raises((CannotLearn, CannotUseLens), match=message):
-        watch.calibrate()
+        find_plane(lens, watch, None)
 
 
 def test_only_a_board_that_is_still_is_taken_from_a_camera() -> None:
