@@ -159,7 +159,7 @@ class BoardWatch:
         if counts.min() < _MIN_CORNERS // 2 or len(self.views) < MIN_VIEWS:
             place = _PLACES[int(counts.argmin())]
             raise CannotLearn(
-                f"{len(self.views)} views, at least {MIN_VIEWS} are needed: show the board at the "
+                f"view {len(self.views)} of at least {MIN_VIEWS} is taken: show the board at the "
                 f"{place} of the picture, and slant it"
             )
         views, errors = self.views, np.empty(0)

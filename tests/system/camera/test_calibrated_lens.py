@@ -44,7 +44,7 @@ def test_lens_and_plane_are_calibrated_one_after_the_other(folder: Path) -> None
         assert "its lens is not calibrated: run 'fishctl camera lens'" in refused
         done = lens(camera.endpoint)
         assert done.returncode == 0, done.stderr
-        assert re.search(r"\d views, at least 10 are needed: show the board at the ", done.stderr)
+        assert re.search(r"view \d+ of at least 10 is taken: show the board at the ", done.stderr)
         assert "error 0." in camera.status().lens
         assert "plane" not in camera.status().lens
     with running_camera(folder, *settings, f"stream.url={folder}/lying.avi") as camera:
@@ -68,7 +68,7 @@ def test_an_interrupted_calibration_changes_nothing(folder: Path, tmp_path: Path
         camera.is_in("streaming")
         with Process(FISHCTL, "camera", "lens", "--camera", camera.endpoint) as process:
             assert process.process.stderr
-            assert "1 views, at least 10 are needed" in process.process.stderr.readline()
+            assert "view 1 of at least 10 is taken" in process.process.stderr.readline()
             status, _, said = process.end(signal.SIGINT)
         assert (status, camera.status().lens) == (130, "")
         assert "interrupted: nothing is calibrated" in said

@@ -94,7 +94,7 @@ def test_a_board_is_written_to_print(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("held-1.png",), "1 views, at least 10 are needed: show the board at the "),
+        (("held-1.png",), "view 1 of at least 10 is taken: show the board at the "),
         (("none.png",), "none.png cannot be read: No such file or directory"),
         (("nothing.png", "--plane"), "nothing.json: no such file"),
     ],

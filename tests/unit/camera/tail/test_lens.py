@@ -147,7 +147,7 @@ def empty(board: FilmedBoard) -> Pictures:
     ("make", "message"),
     [
         (held_flat, "views are too similar: slant the board more, to all sides"),
-        (few, rf"\d views, at least {MIN_VIEWS} are needed: show the board at the"),
+        (few, rf"view \d of at least {MIN_VIEWS} is taken: show the board at the"),
         (on_one_side, "show the board at the (top |bottom )?right of the picture, and slant it"),
         (blurred, r"\d of 40 corners of the board are seen: it must be near, sharp, evenly lit"),
         (far, r"\d of 40 corners of the board are seen: it must be near"),
