@@ -88,10 +88,10 @@ def rename_run(path: Path, name: str) -> Path:
 
 
 def delete_run(path: Path) -> DeletedRun:
-    """Move a run into the trash, and remove what was there too long; raise `RecordingError`."""
+    """Move a run into the trash, and remove older ones from it; raise `RecordingError`."""
     _refuse_in_progress(path)
     trash = path.parent / TRASH
-    with _os_errors(trash, "cannot take it; 'fishctl runs delete --forever' deletes it for ever"):
+    with _os_errors(trash, "cannot take it; delete it with 'fishctl runs delete --forever'"):
         trash.mkdir(exist_ok=True)
         if trash.is_symlink():
             raise OSError(errno.ELOOP, "it is a symbolic link", str(trash))
@@ -102,7 +102,8 @@ def delete_run(path: Path) -> DeletedRun:
     except RecordingError:
         place.rmdir()
         raise
-    empty_trash(path.parent, KEPT_DAYS)
+    with suppress(RecordingError):
+        empty_trash(path.parent, KEPT_DAYS)
     return DeletedRun(place.name, _name_of(path), _deletion_time(place), str(place / path.name))
 
 

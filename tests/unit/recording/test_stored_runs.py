@@ -187,7 +187,7 @@ def no_space(*_: object, **__: object) -> None:
 @pytest.mark.parametrize(
     ("part", "words", "said"),
     [
-        ("mkdir", ("delete", "first"), "'fishctl runs delete --forever' deletes it for ever"),
+        ("mkdir", ("delete", "first"), "delete it with 'fishctl runs delete --forever'"),
         ("rename", ("delete", "swept"), "swept cannot be moved"),
         ("rename", ("rename", "swept", "x"), "swept cannot be moved"),
         ("note", ("note", "first", "x"), "first.note.txt cannot be written"),
