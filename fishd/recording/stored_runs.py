@@ -28,7 +28,7 @@ KEPT_DAYS = 30
 """Time for which a deleted run stays in the trash [days]."""
 PACKED_SUFFIXES = (SUFFIX, ".png", ".parquet", ".onnx", ".zip")
 """Endings of files that are compressed already."""
-_NAME = re.compile(r"\w[\w. -]{0,99}")
+_NAME = re.compile(r"(?!.*\.part$)\w[\w. -]{0,99}")
 _ID, _ID_FORMAT = re.compile(r"\d{8}-\d{6}(-\d+)?", re.A), "%Y%m%d-%H%M%S"
 _READ_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 
@@ -91,7 +91,7 @@ def delete_run(path: Path) -> DeletedRun:
     """Move a run into the trash, and remove older ones from it; raise `RecordingError`."""
     _refuse_in_progress(path)
     trash = path.parent / TRASH
-    with _os_errors(trash, "cannot take it; delete it with 'fishctl runs delete --forever'"):
+    with _os_errors(trash, "cannot take it; 'fishctl runs trash --empty' makes room"):
         trash.mkdir(exist_ok=True)
         if trash.is_symlink():
             raise OSError(errno.ELOOP, "it is a symbolic link", str(trash))
@@ -105,14 +105,6 @@ def delete_run(path: Path) -> DeletedRun:
     with suppress(RecordingError):
         empty_trash(path.parent, KEPT_DAYS)
     return DeletedRun(place.name, _name_of(path), _deletion_time(place), str(place / path.name))
-
-
-def delete_forever(path: Path) -> None:
-    """Remove a run without a way back; raise `RecordingError`."""
-    _refuse_in_progress(path)
-    with _os_errors(path, "cannot be deleted"):
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-        note_path(path).unlink(missing_ok=True)
 
 
 def list_trash(folder: Path) -> list[DeletedRun]:
