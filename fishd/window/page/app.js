@@ -125,7 +125,7 @@ const receive = {
     if (job.state === "dismissed") state.jobs.delete(job.id);
     else state.jobs.set(job.id, job);
     if (before?.state === "running" && job.state !== "running") {
-      notice(job.state === "failed" ? "error" : "info", `${job.kind}: ${job.state}`, job.state === "failed" ? plain(job.lines?.at(-1) ?? "") : "");
+      notice(job.state === "failed" ? "error" : "info", `${job.kind}: ${job.state}`, job.state === "failed" || job.kind === "queue" ? plain(job.lines?.at(-1) ?? "") : "");
     }
     changed();
   },
