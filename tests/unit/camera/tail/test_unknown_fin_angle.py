@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from rigs.filmed_tail import Film, FilmedTail, rest_before, sine
+from rigs.filmed_tail import Film, FilmedTail, Knock, Thing, rest_before, sine
 from rigs.measured_tail import CASES, WEB, find_errors, learn, measure
 
 from fishd.camera.tail.learned import Learned
@@ -25,14 +25,18 @@ def learned() -> Learned:
     return learn(FILM)
 
 
+def swims_past(radius: float) -> Thing:
+    return Thing((-0.85, -0.1), (0.15, 0.0), (2.0 * radius, radius))
+
+
 FAULTS = {
     "a lamp mirrored on the fin": (replace(FILM, glare=(0.65, 0.42, 0.03)), LAMP),
     "a lamp mirrored where the fin begins": (replace(FILM, glare=(0.5, 0.375, 0.03)), LAMP),
     "bubbles": (replace(FILM, bubbles=30), NO_SHAPE),
-    "something that swims past": (replace(FILM, intruder=0.03), FOREIGN),
-    "something large that swims past": (replace(FILM, intruder=0.06), FOREIGN),
-    "a camera that is knocked": (replace(FILM, knock=(BEGIN_S, 0.05)), MOVED),
-    "a camera that is knocked to the other side": (replace(FILM, knock=(BEGIN_S, -0.05)), MOVED),
+    "something that swims past": (replace(FILM, things=(swims_past(0.03),)), FOREIGN),
+    "something large that swims past": (replace(FILM, things=(swims_past(0.06),)), FOREIGN),
+    "a camera that is knocked": (replace(FILM, knock=Knock(BEGIN_S, 0.05)), MOVED),
+    "a camera that is knocked to the other side": (replace(FILM, knock=Knock(BEGIN_S, -0.05)), MOVED),
     "a mount that is turned": (replace(FILM, yaw=0.05), MOVED),
     "a swing larger than learned": (replace(FILM, motion=sine(0.62)), "mrad are beyond the swing"),
     "a tail that left": (replace(FILM, length=0.01), "no tail where it was learned"),
@@ -64,7 +68,7 @@ def test_pictures_between_faults_are_measured(learned: Learned, fault: str) -> N
     assert find_errors(film, measure(film, learned, BEGIN_S, BEGIN_S + 2.0)).known > 0.7
 
 
-@pytest.mark.parametrize("fault", [{"knock": (5.5, 0.05)}, {"yaw": 0.05}], ids=["knock", "mount"])
+@pytest.mark.parametrize("fault", [{"knock": Knock(5.5, 0.05)}, {"yaw": 0.05}], ids=["knock", "mount"])
 def test_a_turn_is_seen_in_rough_water(fault: dict[str, Any]) -> None:
     film = CASES[WEB]
     readings = measure(replace(film, **fault), learn(film), 5.0, 7.0)
