@@ -126,7 +126,7 @@ class Film:
     """Column and row of a mirrored lamp, and its radius, as fractions of the width."""
     bubbles: int = 0
     things: tuple[Thing, ...] = ()
-    knock: Knock = Knock(math.inf)
+    knock: Knock = field(default_factory=lambda: Knock(math.inf))
     torn: float = 0.0
     """Fraction of the tail's length that is missing at the tip."""
     brightness: float = 1.0

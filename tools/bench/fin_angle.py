@@ -1,7 +1,7 @@
 """Errors of the fin angle that is measured in pictures, on films whose fin angle is known.
 
 Each film of the tests is learned from its first 5 s and measured in the next 7 s. The worst of all
-seeds is shown, and after a slash the goal.
+seeds is shown, and after a slash the goal. With --faults, a fault begins at 6 s instead.
 """
 
 import sys
@@ -16,19 +16,25 @@ import numpy as np
 from common.report import DOCS, JOBS, Options, Report, run_cases, table
 
 sys.path.append(str(DOCS.parent / "tests"))
+from rigs.faulty_films import FAULTS, FILMS, fail
 from rigs.filmed_tail import FilmedTail
-from rigs.measured_tail import ASKED, CASES, find_errors
+from rigs.measured_tail import ASKED, CASES, find_errors, learn
 
 from fishd.camera.tail.learner import Learner
 from fishd.camera.tail.meter import TailMeter
 
 OPTIONS: Options = JOBS | {
-    "--seeds": {"type": int, "default": 3, "help": "number of films of each kind"}
+    "--seeds": {"type": int, "default": 3, "help": "number of films of each kind"},
+    "--faults": {"action": "store_true", "help": "measure films with faults"},
 }
+FIRST_SEED = 200
+"""Seed of the first film with faults; nothing was chosen with these."""
 
 
 def measure(options: Namespace) -> Report:
     """Return the table."""
+    if options.faults:
+        return _measure_faults(options)
     films = [(case, seed) for case in CASES for seed in range(options.seeds)]
     results = dict(zip(films, run_cases(_measure_film, films, options.jobs), strict=True))
     rows = []
@@ -53,6 +59,35 @@ def measure(options: Namespace) -> Report:
     return Report(
         {"bench fin_angle": f"{table('film | rms [mrad] | α_max [%]', rows)}\n\n{about}"}, figures
     )
+
+
+def _measure_faults(options: Namespace) -> Report:
+    """Return the table of faults: fractions of all films, and the last to be named."""
+    seeds = range(FIRST_SEED, FIRST_SEED + options.seeds)
+    films = [(film, seed) for seed in seeds for film in FILMS]
+    outcomes = dict(zip(films, run_cases(_measure_outcomes, films, options.jobs), strict=True))
+    rows = []
+    for fault in FAULTS:
+        cells = [fault]
+        for film in FILMS:
+            each = [outcomes[film, seed][fault] for seed in seeds]
+            known, wrong = (100.0 * np.mean([x[index] for x in each]) for index in (0, 1))
+            told = max(x[2] for x in each)
+            cells.append(f"{known:.0f} % / {wrong:.1f} %")
+            if np.isfinite(told):
+                cells[-1] += f" / {told:.1f} s"
+        rows.append(cells)
+    text = table(" | ".join(["fault", *FILMS]), rows)
+    figures = {f"{film}, seed {seed}": outcome for (film, seed), outcome in outcomes.items()}
+    return Report({"bench fin_angle --faults": text}, figures)
+
+
+def _measure_outcomes(case: tuple[str, int]) -> dict[str, tuple[float, float, float]]:
+    """Return the outcome of each fault in a film."""
+    cv2.setNumThreads(1)
+    film = replace(FILMS[case[0]], seed=case[1])
+    learned = learn(film)
+    return {fault: tuple(fail(learned, film, fault, case[1])) for fault in FAULTS}  # type: ignore[misc]
 
 
 def _measure_film(case: tuple[str, int]) -> list[float]:

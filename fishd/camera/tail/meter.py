@@ -55,13 +55,13 @@ _SEEN_TURN = 2.5
 """Factor of the permitted turns of a midline beside edges that show a turn of the camera."""
 _USUAL_TURN = 2.0
 """Permitted turn, relative to that of 95 % of the learned pictures, if that is larger."""
-_KNOCK_S, _DOUBT_S = 0.8, 0.2
+_KNOCK_S, _DOUBT_S = 0.8, 0.1
 """Times over which the turn of the midlines is averaged, for the zero and for one picture [s]."""
 _KNOCK_RAD = 0.012
 """Mean turn above which the zero has moved [rad]."""
 _MEAN_TURN = 0.5
 """The same, relative to the turn that 95 % of single learned pictures stay below."""
-_MIN_KNOCK_READINGS, _MIN_DOUBT_READINGS = 5, 3
+_MIN_KNOCK_READINGS, _MIN_DOUBT_READINGS = 5, 2
 _MIN_SIDE_READINGS = 6
 """Number of readings from which a side of the swing counts for itself."""
 _SCENE_S = 0.2
@@ -241,7 +241,8 @@ class TailMeter:
         self._waves += 0.1 * (line**2 - self._waves)
         self._spread += 0.1 * (differs**2 - self._spread)
         part = min(1.0, _WAVE_GAIN**2 * self._waves / max(self._spread, _MIN_WAVE_RAD**2))
-        of_line = math.hypot(2.0 * math.sqrt(self._spread), 3.5 * line)
+        spread = max(2.0 * math.sqrt(self._spread), abs(differs))
+        of_line = math.hypot(spread, 3.5 * line)
         of_shape = _SHAPE_GAIN * seen.fit.alpha_error
         uncertainty = math.hypot((1.0 - part) * of_line, part * of_shape, 5e-4)
         return seen.alpha - part * differs, uncertainty
@@ -315,7 +316,7 @@ class TailMeter:
         """Return the turns of the latest time [s], and their sides; none if it has gaps."""
         turns = self._turns
         recent = [each for each in turns if each[0] >= turns[-1][0] - span]
-        if not recent or recent[-1][0] - recent[0][0] < 0.7 * span:
+        if not recent or recent[-1][0] - recent[0][0] < 0.6 * span:
             return []
         return [(turn, is_side) for _, turn, is_side in recent]
 
@@ -341,9 +342,7 @@ class TailMeter:
             pose, agreement = self._scene.find_pose(small, light, _SCENE_STEPS)
             undone = self._scene.undo(small, pose).astype(np.uint8)
             before, after = self._count_foreign(small), self._count_foreign(undone)
-            if agreement > _MAX_DISAGREEMENT or (
-                is_foreign and after > _MAX_UNEXPLAINED * before
-            ):
+            if agreement > _MAX_DISAGREEMENT or (is_foreign and after > _MAX_UNEXPLAINED * before):
                 self._poses.clear()
                 return ""
             self._poses.append(unit * pose)
@@ -351,6 +350,7 @@ class TailMeter:
         if abs(turn) > max(_KNOCK_RAD, self._max_pose[2] / math.sqrt(len(self._poses))):
             return _zero_moved(turn)
         return f"the camera has moved by {math.hypot(along, down):.0f} px: learn again"
+
     def _count_foreign(self, small: Pixels) -> int:
         """Return how many pixels that the tail never covers differ from the background."""
         cover = self._ground.cover(small, self._ground.light(small))

@@ -47,9 +47,7 @@ class Scene:
         self._table = -np.concatenate([gradient, turn[:, None]], axis=1).astype(np.float64)
         self._solve = np.linalg.solve(self._table.T @ self._table + _RIDGE, self._table.T)
 
-    def find_pose(
-        self, small: Pixels, light: Floats, steps: int = 1
-    ) -> tuple[Array, float]:
+    def find_pose(self, small: Pixels, light: Floats, steps: int = 1) -> tuple[Array, float]:
         """Return how a small picture is shifted along its rows and down [px of it], and turned.
 
         The second result is the typical difference that this leaves, relative to that without.
@@ -59,7 +57,7 @@ class Scene:
         pose, rest, first = np.zeros(3), np.zeros(1), 0.0
         if self.is_blind:
             return pose, 1.0
-        even = _blur(small / light[:, None])
+        even = _blur(np.asarray(small / light[:, None], np.float32))
         for step in range(steps):
             seen = self.undo(even, pose) if step else even
             difference = (seen - self._level)[self._rows, self._columns].astype(np.float64)
@@ -69,8 +67,9 @@ class Scene:
                 rest = np.abs(difference - self._table @ change)
                 limit = _HUBER * 1.4826 * float(np.median(rest)) + 1e-6
                 weighted = self._table * (limit / np.maximum(rest, limit))[:, None]
-                change = np.linalg.solve(weighted.T @ self._table + _RIDGE, weighted.T @ difference)
-            pose = pose + change
+                table = weighted.T @ self._table + _RIDGE
+                change = np.asarray(np.linalg.solve(table, weighted.T @ difference), np.float64)
+            pose += change
         return pose, float(np.median(rest)) / max(first, 1e-6)
 
     def undo(self, small: Floats | Pixels, pose: Array) -> Floats:

@@ -20,8 +20,7 @@ class Fit(NamedTuple):
     alpha_error: float
     """Change of α that moves the midline by `error` [rad]."""
     turn: float
-    """Angle by which the whole midline is turned about the root [rad]; waves move it least where the
-    covariance of the distances is known."""
+    """Angle by which the whole midline is turned about the root [rad]."""
     error_turned: float
     """Root mean square of the distances that remain after that turn [px]."""
 
