@@ -69,7 +69,7 @@ def _repeat(film: Film, random: np.random.Generator) -> Film:
     return replace(film, repeated=(float(begin), float(begin + random.choice([0.08, 0.3, 3.0]))))
 
 
-def _leave(film: Film, random: np.random.Generator) -> Film:
+def _swing_out(film: Film, random: np.random.Generator) -> Film:
     return replace(film, motion=sine(float(random.uniform(0.9, 1.2))))
 
 
@@ -93,7 +93,7 @@ FAULTS: dict[str, Change] = {
     "light dimmed by half": lambda film, _: replace(film, brightness=0.5),
     "longer exposure": lambda film, _: replace(film, brightness=1.35, exposure=0.03),
     "repeated pictures": _repeat,
-    "tail leaves the picture": _leave,
+    "tail leaves the picture": _swing_out,
     "torn fin": _tear,
 }  # fmt: skip
 

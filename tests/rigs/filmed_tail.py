@@ -64,7 +64,7 @@ class Thing(NamedTuple):
     start: tuple[float, float]
     """Place at time 0: from the left edge, and below the middle row."""
     velocity: tuple[float, float]
-    """Of the picture's width per second."""
+    """Widths of the picture per second."""
     half_axes: tuple[float, float]
     direction: float = 0.5
     """Direction of the first axis against the rows [rad]."""

@@ -51,8 +51,8 @@ _MIN_WHOLE = 15
 _MAX_SHAPE_ERROR = 0.02
 """Largest distance of the midlines from their common shape, relative to the picture's width."""
 _WHITE, _MIN_DEVIATION = 0.5, 0.0005
-"""What is added to the learned variance of distances from the shape: a fraction of it, and the
-square of a distance relative to the picture's width."""
+"""Addition to the learned variance of distances from the shape: a fraction of it, and the square
+of a distance relative to the picture's width."""
 _EDGE_PX = 4.0
 """Distance from the picture's edge at which the tail counts as cut off [px]."""
 

@@ -119,7 +119,7 @@ class FinAngleFit:
     measured: Array
     """Fin angles in the direction of φ_c [rad]."""
     simulated: Array
-    """Those of the identified fish, with the zero of the camera [rad]."""
+    """Fin angles of the identified fish, with the zero of the camera [rad]."""
 
     def to_builtins(self) -> dict[str, Any]:
         """Return everything but the arrays, for JSON."""

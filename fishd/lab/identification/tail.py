@@ -257,7 +257,7 @@ class _Update(NamedTuple):
     """Fitted parameters as in a `Problem`; delay [s], zero [rad] and log scale of the camera."""
     covariance: Array
     residual: Array
-    """Of all fin angles [rad]."""
+    """Measured minus predicted, of all fin angles [rad]."""
     kept: NDArray[np.bool_]
     """Which of them are used."""
     noise: float

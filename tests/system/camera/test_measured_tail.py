@@ -185,7 +185,7 @@ def test_each_point_of_a_sweep_has_the_largest_fin_angle(
     words = ("--on", "live", "--for", "21", "--folder", str(target), "--tail")
     done = fishctl("--endpoint", daemon.endpoint, "sweep", "square", *waves, *words)
     assert done.returncode == 0, done.stderr
-    table = pandas.read_csv(target / "thrust.csv")
+    table = pandas.read_csv(target / "rows.csv")
     assert list(table["parameters.frequency"]) == [1.0, 1.4]
     known = table.dropna(subset="fin_angle_max")  # a busy machine may lose too many pictures
     assert len(known) or "fin angles are unknown" in done.stderr
