@@ -2,6 +2,7 @@
 
 Each film of the tests is learned from its first 5 s and measured in the next 7 s, and some of them
 again with a calibration by a board. The worst of all seeds is shown, and after a slash the goal.
+With --faults, a fault begins at 6 s instead.
 """
 
 import sys
@@ -17,20 +18,26 @@ import numpy as np
 from common.report import DOCS, JOBS, Options, Report, run_cases, table
 
 sys.path.append(str(DOCS.parent / "tests"))
+from rigs.faulty_films import FAULTS, FILMS, fail
 from rigs.filmed_board import calibrate
 from rigs.filmed_tail import FilmedTail
-from rigs.measured_tail import ASKED, ASKED_CALIBRATED, BENT, CASES, find_errors
+from rigs.measured_tail import ASKED, ASKED_CALIBRATED, BENT, CASES, find_errors, learn
 
 from fishd.camera.tail.learner import Learner
 from fishd.camera.tail.meter import TailMeter
 
 OPTIONS: Options = JOBS | {
-    "--seeds": {"type": int, "default": 3, "help": "number of films of each kind"}
+    "--seeds": {"type": int, "default": 3, "help": "number of films of each kind"},
+    "--faults": {"action": "store_true", "help": "measure films with faults"},
 }
+FIRST_SEED = 200
+"""Seed of the first film with faults; nothing was chosen with these."""
 
 
 def measure(options: Namespace) -> Report:
     """Return the table."""
+    if options.faults:
+        return _measure_faults(options)
     cases = [(case, False) for case in CASES] + [(case, True) for case in BENT]
     films = [(*case, seed) for case in cases for seed in range(options.seeds)]
     results = dict(zip(films, run_cases(_measure_film, films, options.jobs), strict=True))
@@ -67,6 +74,35 @@ def measure(options: Namespace) -> Report:
     }
     head = "film | rms [mrad] | α_max [%] | calibrated: rms | α_max"
     return Report({"bench fin_angle": f"{table(head, rows)}\n\n{about}"}, figures)
+
+
+def _measure_faults(options: Namespace) -> Report:
+    """Return the table of faults: fractions of all films, and the last to be named."""
+    seeds = range(FIRST_SEED, FIRST_SEED + options.seeds)
+    films = [(film, seed) for seed in seeds for film in FILMS]
+    outcomes = dict(zip(films, run_cases(_measure_outcomes, films, options.jobs), strict=True))
+    rows = []
+    for fault in FAULTS:
+        cells = [fault]
+        for film in FILMS:
+            each = [outcomes[film, seed][fault] for seed in seeds]
+            known, wrong = (100.0 * np.mean([x[index] for x in each]) for index in (0, 1))
+            told = max(x[2] for x in each)
+            cells.append(f"{known:.0f} % / {wrong:.1f} %")
+            if np.isfinite(told):
+                cells[-1] += f" / {told:.1f} s"
+        rows.append(cells)
+    text = table(" | ".join(["fault", *FILMS]), rows)
+    figures = {f"{film}, seed {seed}": outcome for (film, seed), outcome in outcomes.items()}
+    return Report({"bench fin_angle --faults": text}, figures)
+
+
+def _measure_outcomes(case: tuple[str, int]) -> dict[str, tuple[float, float, float]]:
+    """Return the outcome of each fault in a film."""
+    cv2.setNumThreads(1)
+    film = replace(FILMS[case[0]], seed=case[1])
+    learned = learn(film)
+    return {fault: tuple(fail(learned, film, fault, case[1])) for fault in FAULTS}  # type: ignore[misc]
 
 
 def _measure_film(case: tuple[str, bool, int]) -> list[float]:

@@ -18,7 +18,7 @@ from fishd.core.errors import FishdError
 from fishd.core.schema import note, unit
 
 _HEAD = b"fishd tail %d\n"
-_VERSION = 1
+_VERSION = 2
 _MAX_BYTES = 4 * 2**20
 ORDER = 4
 """Number of powers of α, from 0, in the description of the midline."""
@@ -77,6 +77,21 @@ class Learned(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     ]
     turn_error: Annotated[
         float, unit("rad", "95 % of the midlines were turned less against `shape`.", ge=0)
+    ]
+    covariance: Annotated[
+        tuple[PerStation, ...],
+        note(
+            "Covariance of the distances from `shape` [px²].",
+            min_length=STATIONS,
+            max_length=STATIONS,
+        ),
+    ]
+    shift_error: Annotated[
+        tuple[float, float],
+        unit("px", "95 % of the pictures were shifted less along the rows, and down."),
+    ]
+    scene_turn_error: Annotated[
+        float, unit("rad", "95 % of the pictures were turned less against `background`.", ge=0)
     ]
     pixels_per_mm: Annotated[
         float | None, unit("px/mm", "Scale at the depth of the tail; null if unknown.")
