@@ -27,7 +27,7 @@ from fishd.camera.tail.profile import (
 )
 from fishd.camera.tail.shape import Fit, Shape
 from fishd.core.camera_frames import Pixels
-from fishd.core.tail_reading import TailReading
+from fishd.core.tail_reading import MIDLINE_POINTS, TailReading
 
 _MIN_LENGTH = 0.55
 """Shortest part of the tail that must be seen."""
@@ -68,8 +68,6 @@ _SPAN = 1.25
 """Range of angles relative to that learned."""
 _MIN_REPEATED_RATE = 0.3
 """Speed of the fin above which two equal pictures are one that the camera repeats [rad/s]."""
-MIDLINE_POINTS = 16
-"""Number of points of a midline."""
 
 
 class _Seen(NamedTuple):
