@@ -62,7 +62,7 @@ class VideoTable(Generic[Learned]):
         self.path, self.source = path, source
         self._kind = kind
         self.learned: Learned | None = None
-        """What the rows are measured with; None in a table that has just begun."""
+        """Ground or tail that the rows are measured with; None in a table that has just begun."""
         self.rows = 0
         """Number of pictures in the table."""
         self.part = path.with_name(path.name + ".part")

@@ -24,14 +24,16 @@ from fishd.core.errors import FishdError
 from fishd.core.tail_reading import MIDLINE_POINTS
 
 _WIDTH_PX = 640
-"""Largest width of the pictures in which the fish is searched [px]."""
+"""Largest width of the pictures in which the fish is searched; a small one is then looked at in
+the whole picture [px]."""
 _GROUND_PICTURES = 60
 _UNCOVERED = 0.9
 """Quantile of the grey levels of a place that shows the ground, beginning with the fish's."""
 _MIN_CONTRAST = 12.0
 """Smallest difference of the fish from the ground [grey levels]."""
-_LEVEL = 0.4
-"""Difference that belongs to the fish, relative to its contrast."""
+_LEVEL, _NOISE = 0.15, 6.0
+"""Difference that belongs to the fish, with its thin tail: at least this part of its contrast, and
+this multiple of the usual difference."""
 _MIN_AREA = 0.4
 """Smallest area of a whole fish, relative to the usual one."""
 _END = 0.02
@@ -44,10 +46,14 @@ _TAG_MARGIN = 1.4
 """Side of a tag with its white margin, relative to its side."""
 _MIN_STRIDE = 0.05
 """Smallest way of a beat of a fish that swims on, relative to its length."""
+_MAX_ROUGHNESS = 0.5
+"""Largest second difference of the tail's place from picture to picture, relative to that of noise
+of the same size; five pictures a beat have less."""
 _MAX_FREQUENCY_ERROR = 0.2
 """Largest half-width of the interval of the frequency, relative to it."""
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
 Complex = NDArray[Any]
 
 
@@ -74,7 +80,7 @@ class Seen(NamedTuple):
 class Swim(NamedTuple):
     """Motion of a fish; lengths are in `unit`, intervals are 95 % ones over the beats.
 
-    An interval is NaN for a single beat.
+    An interval is NaN for a single beat, and all values about beats where `problem` says why.
     """
 
     times: Array
@@ -102,6 +108,8 @@ class Swim(NamedTuple):
     excursion: tuple[float, float]
     """From peak to peak of the tail's end, relative to the centre of the fish."""
     beats: int
+    problem: str
+    """Why the beat cannot be measured; else empty."""
 
     @property
     def strouhal(self) -> tuple[float, float] | None:
@@ -110,7 +118,7 @@ class Swim(NamedTuple):
         None for a fish that does not swim on.
         """
         speed, ci95 = self.mean_speed
-        if speed < _MIN_STRIDE * self.length * self.frequency[0] or speed < ci95:
+        if self.problem or speed < _MIN_STRIDE * self.length * self.frequency[0] or speed < ci95:
             return None
         parts = (self.frequency, self.excursion, self.mean_speed)
         number = self.frequency[0] * self.excursion[0] / self.mean_speed[0]
@@ -118,13 +126,15 @@ class Swim(NamedTuple):
 
 
 class FreeGround(Struct, frozen=True):
-    """What a video shows where the fish is not, and how the fish differs from it."""
+    """Picture of a video without the fish, and how the fish differs from it."""
 
     picture: bytes
     """Grey levels, row by row, of a picture of `size`."""
     size: tuple[int, int]
     contrast: float = 0.0
     """Difference of the fish [grey levels]."""
+    level: float = 0.0
+    """Smallest difference that belongs to the fish [grey levels]."""
     area: float = 0.0
     """Usual area of the fish [px]."""
 
@@ -143,19 +153,20 @@ def learn_ground(video: Video) -> FreeGround:
         if place < _GROUND_PICTURES:
             kept[place : place + 1] = [shrink(picture.pixels, _WIDTH_PX)]
     height, width = kept[0].shape
-    levels = np.clip(np.rint(_find_ground(np.stack(kept))), 0, 255).astype(np.uint8)
+    levels = _to_levels(_find_ground(np.stack(kept)))
     finder = FreeFish(FreeGround(levels.tobytes(), (width, height)), video)
-    changes = [finder.find_change(small) for small in kept]
+    changes = [finder.compare(small)[0] for small in kept]
     # The fish may be away in most pictures.
     contrast = float(np.quantile([change.max() for change in changes], 0.8))
     noise = float(np.median([np.median(change) for change in changes]))
-    if contrast < max(_MIN_CONTRAST, 6.0 * noise):
+    if contrast < max(_MIN_CONTRAST, _NOISE * noise):
         raise NoSwim(
             f"{video.shown}: nothing moves against a plain ground: let the fish swim through "
             "the picture"
         )
-    areas = [np.count_nonzero(change > _LEVEL * contrast) for change in changes]
-    return FreeGround(levels.tobytes(), (width, height), contrast, float(np.quantile(areas, 0.8)))
+    level = max(_LEVEL * contrast, _NOISE * noise)
+    area = float(np.quantile([np.count_nonzero(change > level) for change in changes], 0.8))
+    return FreeGround(levels.tobytes(), (width, height), contrast, level, area)
 
 
 class FreeFish:
@@ -167,40 +178,41 @@ class FreeFish:
         self._scale = video.size[0] / ground.size[0]
         self._size, self._read_out = video.size, video.read_out
         self._ground = ground.levels().astype(np.float32)
-        self._contrast, self._area = ground.contrast, ground.area
+        self._whole = np.asarray(cv2.resize(self._ground, video.size), np.float32)
+        self._contrast, self._level, self._area = ground.contrast, ground.level, ground.area
         if tag is not None:
             dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
             settings = cv2.aruco.DetectorParameters()
             settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
             self._detector = cv2.aruco.ArucoDetector(dictionary, settings)
 
-    def find_change(self, small: Pixels) -> NDArray[np.float32]:
-        """Return the difference from the ground in the same light, of a small picture."""
+    def compare(self, small: Pixels) -> tuple[Floats, float]:
+        """Return the difference of a small picture from the ground, and its relative light."""
         some = slice(None, None, 4)
         ratio = small[some, some] / np.maximum(self._ground[some, some], 1.0)
         light = max(float(np.median(ratio)), 1e-3)
-        change = np.abs(small / light - self._ground).astype(np.float32)
-        return np.asarray(cv2.blur(change, (3, 3)), np.float32)
+        return _difference(small, light, self._ground), light
 
     def find(self, picture: VideoPicture) -> Seen:
         """Return the fish in a picture."""
-        change = self.find_change(shrink(picture.pixels, _WIDTH_PX))
-        mask = (change > _LEVEL * self._contrast).astype(np.uint8)
+        change, light = self.compare(shrink(picture.pixels, _WIDTH_PX))
         tag = None if self._tag is None else self._find_tag(picture.pixels)
-        if tag is not None:  # it may look like the ground, and so divide the fish
-            centre = tag.mean(axis=0)
-            outline = ((tag - centre) * _TAG_MARGIN + centre + 0.5) / self._scale - 0.5
-            cv2.fillConvexPoly(mask, np.rint(outline).astype(np.int32), 1)
-        elif self._tag is not None:
+        if self._tag is not None and tag is None:
             return Seen(picture.time, reason="its tag is not seen")
-        count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
-        sizes = stats[1:count, cv2.CC_STAT_AREA]
-        if not len(sizes) or sizes.max() < _MIN_AREA * self._area:
+        scale, corner = self._scale, np.zeros(2)
+        labels, best, box = self._find_largest(change, tag, scale, corner)
+        if box[4] < _MIN_AREA * self._area:
             return Seen(picture.time, reason="no fish is seen")
-        best = 1 + int(sizes.argmax())
-        left, top, width, height = stats[best, :4]
-        if min(left, top) == 0 or left + width == mask.shape[1] or top + height == mask.shape[0]:
+        first, last = box[:2], box[:2] + box[2:4]
+        if first.min() == 0 or (last == labels.shape[::-1]).any():
             return Seen(picture.time, reason="the fish leaves the picture")
+        if scale > 1.0 and scale * (last - first).max() < _WIDTH_PX:
+            first = np.maximum(0, (scale * (first - 2)).astype(int))
+            last = np.ceil(scale * (last + 2)).astype(int)
+            part = slice(first[1], last[1]), slice(first[0], last[0])
+            change = _difference(picture.pixels[part], light, self._whole[part])
+            scale, corner = 1.0, first.astype(np.float64)
+            labels, best, _ = self._find_largest(change, tag, scale, corner)
         rows, columns = np.nonzero(labels == best)
         points = np.stack([columns, rows], axis=1).astype(np.float64)
         weight = np.clip(change[rows, columns] / self._contrast, 0.0, 1.0)
@@ -210,10 +222,10 @@ class FreeFish:
         along = (points - place) @ (math.cos(axis), math.sin(axis))
         seen = Seen(
             time=picture.time,
-            place=self._to_picture(place),
+            place=(place + 0.5) * scale - 0.5 + corner,
             axis=axis,
-            length=float(np.ptp(along)) * self._scale,
-            midline=self._to_picture(_find_midline(points, along)),
+            length=float(np.ptp(along) - 1.0) * scale,  # the blur lets it end a pixel later
+            midline=(_find_midline(points, along) + 0.5) * scale - 0.5 + corner,
         )
         if tag is None:
             return self._at_row_time(seen)
@@ -231,8 +243,23 @@ class FreeFish:
         late += row_time * (seen.place[1] / max(height - 1, 1) - 0.5)
         return seen._replace(time=float(seen.time + late))
 
-    def _to_picture(self, places: Array) -> Array:
-        return (places + 0.5) * self._scale - 0.5
+    def _find_largest(
+        self, change: Floats, tag: Array | None, scale: float, corner: Array
+    ) -> tuple[NDArray[np.int32], int, NDArray[np.int32]]:
+        """Return labels of what differs, the label of the largest, and its box and area.
+
+        scale, corner: pixels of the picture for one of `change`, and its place in the picture
+        """
+        mask = (change > self._level).astype(np.uint8)
+        if tag is not None:  # it may look like the ground, and so divide the fish
+            centre = tag.mean(axis=0)
+            outline = (tag - centre) * _TAG_MARGIN + centre - corner
+            outline = (outline + 0.5) / scale - 0.5
+            cv2.fillConvexPoly(mask, np.rint(outline).astype(np.int32), 1)
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
+        best = int(stats[1:, cv2.CC_STAT_AREA].argmax()) + 1 if len(stats) > 1 else 0
+        box = stats[best] if best else np.zeros(5, np.int32)
+        return np.asarray(labels, np.int32), best, np.asarray(box, np.int32)
 
     def _find_tag(self, picture: Pixels) -> Array | None:
         """Return the corners of the tag, clockwise from its upper left one."""
@@ -241,6 +268,11 @@ class FreeFish:
             if name == self._tag:
                 return np.asarray(corner, np.float64).reshape(4, 2)
         return None
+
+
+def _difference(pixels: Pixels, light: float, ground: Floats) -> Floats:
+    change = np.abs(pixels / light - ground).astype(np.float32)
+    return np.asarray(cv2.blur(change, (3, 3)), np.float32)
 
 
 def _find_midline(points: Array, along: Array) -> Array:
@@ -259,17 +291,21 @@ def _find_midline(points: Array, along: Array) -> Array:
     return midline
 
 
-def _find_ground(pictures: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _find_ground(pictures: NDArray[np.uint8]) -> Floats:
     """Return the picture without the fish, which may cover a place most of the time, or always."""
-    low, middle, high = np.quantile(pictures, [1.0 - _UNCOVERED, 0.5, _UNCOVERED], axis=0)
+    levels = np.quantile(pictures, np.linspace(1.0 - _UNCOVERED, _UNCOVERED, 5), axis=0)
+    low, middle, high = levels[::2]
     change = np.asarray(cv2.blur(high - low, (3, 3)))
     moving = change > 0.5 * (change.min() + change.max())
     if change.max() < max(_MIN_CONTRAST, 3.0 * float(np.median(change))):  # it is noise
         return np.asarray(middle, np.float32)
     level = np.median(middle[~moving])
     is_dark = level - np.median(low[moving]) > np.median(high[moving]) - level
-    ground, fish = (high, low) if is_dark else (low, high)
-    ground = np.asarray(ground + np.median((middle - ground)[~moving]), np.float32)
+    fish = low if is_dark else high
+    some = levels[2:] if is_dark else levels[:3]  # a tag may be on the other side of the ground
+    some = some + np.median((middle - some)[:, ~moving], axis=1)[:, None, None]
+    nearest = np.abs(some - level).argmin(axis=0)
+    ground = np.take_along_axis(some, nearest[None], axis=0)[0].astype(np.float32)
     is_like_fish = np.abs(ground - np.median(fish[moving])) < np.abs(ground - level)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(is_like_fish.astype(np.uint8))
     near = np.unique(labels[cv2.dilate(moving.astype(np.uint8), np.ones((5, 5))) > 0])
@@ -278,8 +314,12 @@ def _find_ground(pictures: NDArray[np.uint8]) -> NDArray[np.float32]:
     inside &= top + height < moving.shape[0]  # else it may be the wall of the tank
     body = np.isin(labels, [label for label in near if label and inside[label]]).astype(np.uint8)
     body = np.asarray(cv2.dilate(body, np.ones((9, 9))), np.uint8)
-    levels = np.clip(np.rint(ground), 0, 255).astype(np.uint8)
-    return np.where(body > 0, cv2.inpaint(levels, body, 3.0, cv2.INPAINT_TELEA), ground)
+    filled = cv2.inpaint(_to_levels(ground), body, 3.0, cv2.INPAINT_TELEA)
+    return np.where(body > 0, filled, ground)
+
+
+def _to_levels(ground: Floats) -> Pixels:
+    return np.clip(np.rint(ground), 0, 255).astype(np.uint8)
 
 
 def describe_swim(
@@ -310,6 +350,7 @@ def describe_swim(
     pairs = [scale * (seen[k] + 1j * seen[k + 1]) for k in (1, 6, 8)]
     place, first, second = (resample(pair) for pair in pairs)
     axis, step, window = resample(np.exp(2j * seen[3])), grid[1] - grid[0], _SMOOTH_S
+    problem = ""
     for _ in range(2):  # the second time over whole beats
         count = max(1, round(window / step)) | 1
         heading = 0.5 * np.unwrap(np.angle(_smooth(axis, count)))
@@ -329,7 +370,8 @@ def describe_swim(
         begins = np.concatenate([turn[:-1] for turn in turns])
         ends = np.concatenate([turn[1:] for turn in turns])
         if not len(begins):
-            raise NoSwim("fewer than two whole beats of the tail are seen: a longer video helps")
+            problem = "fewer than two whole beats are seen: a longer video helps"
+            break
         window = float(np.median(ends - begins))
     usual = ends - begins < 1.5 * window  # no beat between was left out
     begins, ends = begins[usual], ends[usual]
@@ -337,7 +379,11 @@ def describe_swim(
     moved *= np.interp(0.5 * (begins + ends), grid, ahead).conj()
     frequency = _average(1.0 / (ends - begins))
     if frequency[1] > _MAX_FREQUENCY_ERROR * frequency[0]:
-        raise NoSwim("the tail does not beat evenly enough to be measured")
+        problem = "it is not even enough to be measured"
+    if np.diff(swing, 2).std() > _MAX_ROUGHNESS * math.sqrt(6.0) * swing.std():
+        problem = "it is lost in the noise, or between the pictures"
+    excursion = _average(np.array([2.0 * beat.alpha_max for beat in tops + backs]))
+    unknown = (math.nan, math.nan)
     margin = (count + 1) * step  # no whole mean there
     edge = (times < grid[0] + margin) | (times > grid[-1] - margin)
     velocity = np.gradient(_smooth(place, count), step)
@@ -353,10 +399,11 @@ def describe_swim(
         scale=float(scale),
         unit="px" if length_mm is None else "mm",
         length=float(length * scale),
-        mean_speed=_average(moved.real / (ends - begins)),
-        frequency=frequency,
-        excursion=_average(np.array([2.0 * beat.alpha_max for beat in tops + backs])),
+        mean_speed=unknown if problem else _average(moved.real / (ends - begins)),
+        frequency=unknown if problem else frequency,
+        excursion=unknown if problem else excursion,
         beats=max(len(tops), len(backs)),
+        problem=problem,
     )
 
 
@@ -366,7 +413,7 @@ def _average(values: Array) -> tuple[float, float]:
     Such beats overlap by half, so they count half.
     """
     mean = average([Beat(0.0, float(value), 0.0) for value in values])
-    value, ci95 = mean or (values[0], math.nan)
+    value, ci95 = mean or (values[0] if len(values) else math.nan, math.nan)
     return float(value), math.sqrt(2.0) * ci95
 
 

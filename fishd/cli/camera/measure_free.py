@@ -78,24 +78,27 @@ def measure_free(path: Path, options: VideoOptions, *, as_json: bool) -> int:
             "beats": swim.beats,
         }
         values |= {"unit": unit, "length": swim.length, "table": str(table.path)}
+        values["problem"] = swim.problem or None
         for name in ("mean_speed", "frequency", "excursion", "strouhal"):
             values[name], values[f"{name}_ci95"] = getattr(swim, name) or (None, None)
         print_json(values)
         return 0
-    strouhal = "unknown: the fish does not swim on"
-    if swim.strouhal:
-        strouhal = f"{_format(swim.strouhal, '')}(frequency × excursion / speed)"
-    echo_rows(
-        [
-            ("fish", f"{swim.length:.1f} {unit} long, in {known} of "
-             f"{format_count(pictures, 'picture')}"),
+    of = format_count(pictures, "picture")
+    rows = [("fish", f"{swim.length:.1f} {unit} long, in {known} of {of}")]
+    if swim.problem:
+        rows.append(("tail beat", f"unknown: {swim.problem}"))
+    else:
+        strouhal = "unknown: the fish does not swim on"
+        if swim.strouhal:
+            strouhal = f"{_format(swim.strouhal, '')}(frequency × excursion / speed)"
+        beats = format_count(swim.beats, "beat")
+        rows += [
             ("speed", _format(swim.mean_speed, f"{unit}/s")),
-            ("tail beat", f"{_format(swim.frequency, 'Hz')}, {format_count(swim.beats, 'beat')}"),
+            ("tail beat", f"{_format(swim.frequency, 'Hz')}, {beats}"),
             ("excursion", f"{_format(swim.excursion, unit)} from peak to peak"),
             ("Strouhal", strouhal),
-            ("table", str(table.path)),
         ]
-    )  # fmt: skip
+    echo_rows([*rows, ("table", str(table.path))])
     return 0
 
 
