@@ -17,6 +17,7 @@ import click
 from msgspec import to_builtins
 from msgspec.structs import replace
 
+from fishd.cli import dry_run
 from fishd.cli.config import config_option, set_option
 from fishd.cli.controller_arguments import ControllerGroup
 from fishd.cli.experiment_options import (
@@ -269,6 +270,8 @@ class Run:
 
         If the output is JSON, it is on standard error.
         """
+        if dry_run.is_active.get():
+            return
         if not self._has_begun:
             self._has_begun = True
             echo(f"fish: {self.fish}", err=self.as_json)
@@ -297,6 +300,7 @@ class Run:
         from fishd.lab.swim_log import SwimLog
         from fishd.recording.folder import list_recordings
 
+        dry_run.end_of_check(total - since if unit == "s" and self.fish.on == "live" else None)
         self.echo()
         session, experiment, began = self._session, self._experiment, False
         with self.ending.measuring(), ExitStack() as stack:

@@ -7,6 +7,7 @@ import click
 from fishd.cli.experiment import MEASURED_TAIL, ResumableGroup, Run, experiment_options
 from fishd.cli.options import FiniteRange, for_option
 from fishd.cli.output import echo, format_controller
+from fishd.controllers.base import Limits
 from fishd.core.console import format_power
 
 if TYPE_CHECKING:
@@ -44,9 +45,12 @@ def _measure(
     from fishd.lab import measurement, measurement_figure
     from fishd.lab.error_budget import warn_of_unknown_calibration
     from fishd.lab.session import LiveSession
+    from fishd.lab.sweep import grid
 
     plan(seconds, parameters, settle)  # before the experiment has a folder
     session = run.session()
+    if run.fish.on == "live":
+        grid.check_remote([grid.Point(name, parameters)], Limits(session.amplitude, session.tick))
     run.open({"controller": name, "parameters": parameters, "for": seconds, "settle": settle})
     with run.swimming(seconds):
         measured = measurement.measure(session, name, parameters, seconds, settle)

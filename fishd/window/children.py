@@ -3,6 +3,7 @@
 import asyncio
 import os
 import shlex
+from collections.abc import Iterable
 from pathlib import Path
 
 from fishd.core import text
@@ -24,10 +25,15 @@ class JobError(FishdError):
     """A job cannot be started, or there is none."""
 
 
+def fishctl_command(words: Iterable[str]) -> list[str]:
+    """Return the command of a fishctl that ends with this process."""
+    return python_command("-c", _CHILD, str(os.getpid()), *words)
+
+
 async def spawn(words: list[str], runs: Path) -> asyncio.subprocess.Process:
     """Start fishctl; runs: folder of recordings and experiments."""
     return await asyncio.create_subprocess_exec(
-        *python_command("-c", _CHILD, str(os.getpid()), *words),
+        *fishctl_command(words),
         stdin=asyncio.subprocess.DEVNULL,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,

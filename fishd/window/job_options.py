@@ -16,6 +16,8 @@ Word = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_.][A-Za-z0-9_.:,+=-]*\Z", max_l
 RunName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_. -]*\Z", max_length=100)]
 Line = Annotated[str, Meta(pattern=PRINTABLE, max_length=200)]
 Seconds = Annotated[float, Meta(gt=0, le=86400)]
+QUEUE = "queue"
+"""Kind of the job that runs the queue, whose experiments have their own folders."""
 Value = bool | int | float | Word | None
 
 
@@ -72,6 +74,12 @@ class RerunOptions(Struct, forbid_unknown_fields=True):
     parameters: dict[Name, Value] = {}
 
 
+class QueueOptions(Struct, forbid_unknown_fields=True):
+    """Options of the runner of the queue."""
+
+    take: bool = False
+
+
 class ResumeOptions(Struct, forbid_unknown_fields=True):
     """Options of resume: the folder of an experiment that is not complete."""
 
@@ -87,11 +95,12 @@ KINDS: dict[str, type[Struct]] = {
     "simulate": SimulateOptions,
     "rerun": RerunOptions,
     "resume": ResumeOptions,
+    QUEUE: QueueOptions,
 }
 """Options of each kind of job."""
 MEASURED_KINDS = {"measure", "sweep", "compare"}
 """Kinds of jobs whose `seconds` must be enough for two swims between rests."""
-DRIVING_KINDS = MEASURED_KINDS | {"resume"}
+DRIVING_KINDS = MEASURED_KINDS | {"resume", QUEUE}
 """Kinds of jobs that swim the fish."""
 
 
@@ -108,6 +117,8 @@ def list_words(kind: str, options: Any) -> list[str]:
 def _list_arguments(kind: str, options: Any) -> Iterable[str]:
     if kind == "record":
         return [options.name] if options.name else []
+    if kind == QUEUE:
+        return ["start"]
     if kind == "compare":
         return list(options.contestants)
     if kind == "rerun":
@@ -123,7 +134,7 @@ def _list_options(kind: str, options: Any) -> Iterator[tuple[str, Any]]:
                 yield name, value
         if options.seconds:
             yield "for", options.seconds
-    else:
+    elif kind != QUEUE:
         for name, value in getattr(options, "parameters", {}).items():
             yield name.replace("_", "-"), value
         if kind == "compare" and options.runs > 1:

@@ -17,6 +17,7 @@ from fishd.window.fish_link import Busy, FishLink
 from fishd.window.job_options import DRIVING_KINDS, KINDS, MEASURED_KINDS, list_words
 from fishd.window.jobs import Jobs
 from fishd.window.pages import Pages
+from fishd.window.run_requests import RunRequests
 
 MAX_WAITING_REQUESTS = 16
 """Number of requests that wait for the disk of runs above which a further one is refused."""
@@ -36,6 +37,8 @@ class JobRequests:
     def __init__(self, access: AccessControl, pages: Pages, jobs: Jobs) -> None:
         self._access, self._pages, self._jobs = access, pages, jobs
         self._waiting = 0
+        self.folder = jobs.runs.folder
+        """Folder of recordings and experiments."""
         self.routes = [
             web.get("/api/jobs", self._list_jobs),
             web.post("/api/jobs", self._start_job),
@@ -44,10 +47,11 @@ class JobRequests:
             web.post("/api/jobs/{job}/dismiss", self._dismiss_job),
             web.get("/api/runs", self._list_runs),
             web.get("/api/runs/{run}/plot.png", self._plot_run),
+            *RunRequests(access, jobs.runs, self.waiting_for_disk).routes,
         ]
 
     @contextmanager
-    def _waiting_for_disk(self) -> Iterator[None]:
+    def waiting_for_disk(self) -> Iterator[None]:
         """Count a request that may wait for the disk of runs; raise `Busy` for one too many."""
         if self._waiting >= MAX_WAITING_REQUESTS:
             raise Busy(f"{self._waiting} requests wait for the disk of the runs; try again later")
@@ -64,6 +68,10 @@ class JobRequests:
     async def _read_job(self, request: web.Request) -> tuple[JobRequest, FishLink, Any]:
         """Return the job that a page wants, its fish, and its options; raise `ApiError`."""
         body = await read_body(request, JobRequest)
+        return body, *self.check_job(body)
+
+    def check_job(self, body: JobRequest) -> tuple[FishLink, Any]:
+        """Return the fish of a job, and its options; raise `ApiError`."""
         link = self._pages.find_link(body.fish)
         if body.kind not in KINDS:
             message = f"no such kind '{text.quoted(body.kind)}'; valid: {', '.join(KINDS)}"
@@ -73,7 +81,7 @@ class JobRequests:
             _check_parameters(options, link.controllers)
         if body.kind in MEASURED_KINDS:
             _check_length(options)
-        return body, link, options
+        return link, options
 
     async def _check_job(self, request: web.Request) -> web.Response:
         """Answer with the command line of a job, and what is wrong with it; start nothing."""
@@ -99,7 +107,7 @@ class JobRequests:
         if body.kind in DRIVING_KINDS:
             await link.give_back()  # the experiment takes the fish itself
         endpoint, device = link.endpoint_options, access.device_id
-        with self._waiting_for_disk():
+        with self.waiting_for_disk():
             job = await self._jobs.start(body.kind, link.name, endpoint, options, device, check)
         self._pages.tell_job(job)
         return success(job)
@@ -118,12 +126,12 @@ class JobRequests:
 
     async def _list_runs(self, request: web.Request) -> web.Response:
         self._access.require(request, "watch")
-        with self._waiting_for_disk():
+        with self.waiting_for_disk():
             return success(await self._jobs.runs.list_all())
 
     async def _plot_run(self, request: web.Request) -> web.Response:
         self._access.require(request, "watch")
-        with self._waiting_for_disk():
+        with self.waiting_for_disk():
             picture = await self._jobs.runs.plot(request.match_info["run"])
         return web.Response(body=picture, content_type="image/png")
 

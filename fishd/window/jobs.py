@@ -22,7 +22,7 @@ from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError
 from fishd.window.children import JobError, spawn
 from fishd.window.curves import read_curve
-from fishd.window.job_options import DRIVING_KINDS, ResumeOptions, list_words
+from fishd.window.job_options import DRIVING_KINDS, QUEUE, ResumeOptions, list_words
 from fishd.window.runs import Runs
 
 MAX_RUNNING_JOBS = 4
@@ -130,6 +130,8 @@ class Jobs:
     def _describe_remains(self, job: Job) -> str:
         """Return what is left of a job that was lost; mark it done or resumable if it is."""
         what = "fishd-window was killed while this ran"
+        if job.kind == QUEUE:
+            return f"{what}, and the fish came to rest; the queue waits for a start"
         if job.kind in DRIVING_KINDS:
             self._conclude(job)
             if job.state == "done":
@@ -189,7 +191,8 @@ class Jobs:
             raise JobError(f"{self._folder} cannot be created: {error.strerror}") from None
         if kind == "resume":
             return self._resume(options)
-        run = f"{kind}-{datetime.now():%Y%m%d-%H%M%S}" if kind in DRIVING_KINDS else ""
+        has_folder = kind in DRIVING_KINDS and kind != QUEUE
+        run = f"{kind}-{datetime.now():%Y%m%d-%H%M%S}" if has_folder else ""
         return kind, self._unused_run(run) if run else "", list_words(kind, options)
 
     def _start_prepared(
@@ -246,6 +249,8 @@ class Jobs:
             return [f"--folder={self._folder}", "--json"]
         if job.kind == "simulate":
             return [f"--record={self._recording_of(job)}", "--json"]
+        if job.kind == QUEUE:
+            return ["--json"]
         place = [] if is_resumed else ["--on=live", f"--folder={self._folder / job.run}"]
         return [*place, "--json"]
 

@@ -21,6 +21,7 @@ from fishd.window.live import encode
 from fishd.window.metrics import MetricsRequests
 from fishd.window.pages import Pages
 from fishd.window.paired_devices import PairedDevices
+from fishd.window.queue_requests import QueueRequests
 from fishd.window.register import Register, take_lost_jobs
 from fishd.window.settings import WindowSettings
 from fishd.window.web_server import WebServer, file_routes
@@ -51,6 +52,7 @@ class WindowServer(WebServer):
             lambda: self.viewers,
             self._jobs.stop_without_access,
         )
+        job_requests = JobRequests(access, self._pages, self._jobs)
         host, port = settings.address
         routes = [
             *file_routes(resources.files(__package__).joinpath("page"), "index.html"),
@@ -58,7 +60,8 @@ class WindowServer(WebServer):
             web.get("/foxglove", self._serve_foxglove),
             *access.routes,
             *FishRequests(access, self._pages).routes,
-            *JobRequests(access, self._pages, self._jobs).routes,
+            *job_requests.routes,
+            *QueueRequests(access, self._pages, job_requests).routes,
             *MetricsRequests(access, self._pages.links, settings.runs_folder).routes,
         ]
         super().__init__(

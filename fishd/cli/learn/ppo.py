@@ -11,6 +11,7 @@ import click
 from msgspec import to_builtins
 from msgspec.structs import replace
 
+from fishd.cli import dry_run
 from fishd.cli.config import config_option, set_option
 from fishd.cli.experiment import Ending
 from fishd.cli.experiment_options import (
@@ -196,6 +197,7 @@ def ppo(
     changed = {name: value for name, value in given_settings.items() if value is not None}
     job = replace(job, agent=agent, settings=replace(job.settings, **changed))
     job = _add_camera(job, camera_config or camera)
+    dry_run.end_of_check()
     if seeds is not None:
         job = replace(job, resume=resumes_seeds)
         status, draw = _train_seeds(job, seeds, jobs, cluster, as_json), figure.draw_seeds

@@ -14,12 +14,15 @@ from fishd.cli.output import echo, format_count, print_json, print_json_line, pr
 from fishd.cli.verbs import pause_garbage_collector
 from fishd.core import files
 from fishd.core.addresses import control_address, find_control_address
+from fishd.core.errors import FishdError
 from fishd.core.process.interruption import raise_on_first_signal
 from fishd.recording import Run, open_run
 from fishd.recording.folder import (
+    EXPERIMENT,
     FOLDER_VARIABLE,
     check_new_files,
     find_recording,
+    list_recordings,
     runs_folder,
 )
 from fishd.recording.reader import RECOVERED
@@ -107,7 +110,7 @@ def export(
 
 
 @click.command()
-@click.argument("run")
+@click.argument("runs", nargs=-1, required=True, metavar="RUN...")
 @click.option(
     "--from", "begin", type=FiniteRange(min=0), default=0.0, help="Begin at this time [s]."
 )
@@ -120,7 +123,7 @@ def export(
 @json_option
 @pause_garbage_collector()
 def plot(
-    run: str,
+    runs: tuple[str, ...],
     begin: float,
     end: float | None,
     target: Path | None,
@@ -132,28 +135,53 @@ def plot(
 
     RUN is a path, a name in the folder of recordings, or 'latest'. Of an experiment, its last
     recording is drawn; of a measurement, its drift and its thrust; of a training, its progress.
+    Several runs are drawn over each other, each from the beginning of its swim.
     """
-    from fishd.lab.experiment import HEADER
-    from fishd.lab.run_figure import draw_run
+    from fishd.lab.run_figure import draw_run, draw_runs
     from fishd.lab.run_traces import traces
 
-    experiment = files.expand_user(run) if "/" in run else (folder or runs_folder()) / run
-    if (experiment / HEADER).is_file():
-        if begin or end is not None:
-            raise click.UsageError("--from and --until are for a recording, not an experiment")
-        path = target or experiment
-        path = path / f"{experiment.name}.png" if path.is_dir() else path
-        check_new_files([path], replace=force)
-        _draw_experiment(experiment, path)
-        print_paths([path], as_json)
-        return
-    recorded = open_recording(run, folder)
-    run_traces = traces(recorded, begin, math.inf if end is None else end)
-    path = target or recorded.path.parent
-    path = path / f"{recorded.name}.png" if path.is_dir() else path
+    experiments = [_find_experiment(run, folder) for run in runs]
+    if any(experiments) and (begin or end is not None):
+        raise click.UsageError("--from and --until are for a recording, not an experiment")
+    experiment = experiments[0] if len(runs) == 1 else None
+    recordings = (
+        []
+        if experiment
+        else [_open_plotted(*pair, folder) for pair in zip(runs, experiments, strict=True)]
+    )
+    last = math.inf if end is None else end
+    drawn = [traces(recording, begin, last) for recording in recordings]
+    path = target or experiment or recordings[0].path.parent
+    if path.is_dir():
+        stem = experiment.name if experiment else recordings[0].name
+        path = path / f"{stem}{'-compared' if len(runs) > 1 else ''}.png"
     check_new_files([path], replace=force)
-    draw_run(run_traces, path)
+    if experiment:
+        _draw_experiment(experiment, path)
+    elif len(drawn) == 1:
+        draw_run(drawn[0], path)
+    else:
+        names = [
+            found.name if found else r.name
+            for found, r in zip(experiments, recordings, strict=True)
+        ]
+        draw_runs(dict(zip(names, drawn, strict=True)), path)
     print_paths([path], as_json)
+
+
+def _find_experiment(run: str, folder: Path | None) -> Path | None:
+    """Return the folder of an experiment; None for a recording."""
+    path = files.expand_user(run) if "/" in run else (folder or runs_folder()) / run
+    return path if (path / EXPERIMENT).is_file() else None
+
+
+def _open_plotted(run: str, experiment: Path | None, folder: Path | None) -> Run:
+    """Open a recording, or the last one of an experiment; raise `FishdError`."""
+    if experiment is None:
+        return open_recording(run, folder)
+    if recordings := list_recordings(experiment):
+        return open_run(recordings[-1])
+    raise FishdError(f"{experiment}: nothing can be drawn: it contains no recording")
 
 
 def _draw_experiment(folder: Path, path: Path) -> None:

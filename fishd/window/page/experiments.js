@@ -1,7 +1,8 @@
 // Experiments as child processes of the server: a form, and the jobs with the command line that each ran.
-import { call, controllerText, duration, forceUnit, html, interval, number, numberIn, recall, remember, sentence, useEffect, useState } from "./common.js";
+import { call, controllerText, duration, forceUnit, html, interval, number, numberIn, quote, recall, remember, sentence, useEffect, useState } from "./common.js";
 import { Curve } from "./curve.js";
 import { defaultOf, missingOf, selectionOf, shownParameters } from "./fields.js";
+import { AddToQueue, Queue } from "./queue.js";
 
 const KINDS = {
   measure: { title: "Measure", text: "Swims and rests in turn; thrust with its 95 % interval." },
@@ -19,7 +20,7 @@ const input = (label, value, set, more = {}) => html`<label class="row"><span>${
   <input value=${value} autocomplete="off" onInput=${(event) => set(event.target.value)} ...${more} /></label>`;
 
 /** Kinds that swim the fish, and so need the driver's role. */
-const DRIVING = ["measure", "sweep", "compare", "resume"];
+const DRIVING = ["measure", "sweep", "compare", "resume", "queue"];
 
 /** Start a job; take the driver's role first where it needs it. Say why it was refused, and offer to take the fish. */
 export async function startJob({ state, notice, changed, becomeDriver }, kind, options, take = false) {
@@ -114,7 +115,7 @@ export function Experiments(page) {
     event.preventDefault();
     startJob(page, form.kind, given(options()));
   };
-  const jobs = [...state.jobs.values()].filter(({ fish }) => !fish || fish === state.name).sort((a, b) => b.id - a.id).slice(0, 8);
+  const jobs = [...state.jobs.values()].filter(({ fish, kind }) => kind !== "queue" && (!fish || fish === state.name)).sort((a, b) => b.id - a.id).slice(0, 8);
   return html`
     <h2 id="experiments-title">Experiments</h2>
     <div class="tabs" role="tablist" aria-label="Kind of experiment">
@@ -149,10 +150,12 @@ export function Experiments(page) {
       </div>
       <div class="buttons">
         <button class="primary" disabled=${!mayDrive || !isReady || problem !== ""}>${form.kind === "simulate" ? "Try on a simulated fish" : KINDS[form.kind].title}</button>
+        ${DRIVING.includes(form.kind) && html`<${AddToQueue} page=${page} kind=${form.kind} options=${() => given(options())} disabled=${!mayDrive || !isReady || problem !== ""} />`}
         ${form.kind === "compare" && controller && html`<button type="button"
           onClick=${() => set("contestants")(`${form.contestants.trim()} ${controllerText(controller.name, own)}`.trim())}>Add ${controller.name}</button>`}
       </div>
     </form>
+    <${Queue} page=${page} />
     <ul class="jobs" aria-label="Started experiments">
       ${jobs.map((job) => html`<${Job} key=${job.id} job=${job} state=${state} notice=${notice} mayDrive=${mayDrive}
         resume=${() => startJob(page, "resume", { run: job.run })} />`)}
@@ -181,9 +184,6 @@ function expected([, verb, ...words]) {
 
 /** Return a line of fishctl without its name. */
 export const plain = (line) => line.replace(/^fishctl: /, "");
-
-/** Quote a word as a shell needs it. */
-const quote = (word) => (/^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`);
 
 const received = new WeakMap();
 

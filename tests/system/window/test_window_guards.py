@@ -34,6 +34,10 @@ CHANGES = [
     ("/api/jobs/check", {"fish": "fish", "kind": "record"}),
     ("/api/jobs/1/stop", {}),
     ("/api/jobs/1/dismiss", {}),
+    ("/api/runs/x/note", {"note": "x"}),
+    ("/api/runs/x/rename", {"name": "y"}),
+    ("/api/runs/x/delete", {}),
+    ("/api/trash/20260101-000000/restore", {}),
 ]
 
 
@@ -93,7 +97,8 @@ async def test_another_site_starts_no_reading_either_where_the_browser_tells(
     async with Browser(window.url) as browser:
         for site in ("cross-site", "same-site"):
             headers = {"Sec-Fetch-Site": site}
-            for path in ("/api/runs", "/metrics"):
+            download = "/api/runs/x/download/all.zip"
+            for path in ("/api/runs", "/metrics", download, "/api/trash", "/api/results?run=x"):
                 refused = await browser.refusal(path, headers=headers)
                 assert refused == (403, "other-origin")
 

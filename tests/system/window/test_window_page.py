@@ -11,17 +11,16 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import APIResponse, Page, Route, expect
 from rigs.browser import needs_browser, open_page, shared_browser
-from rigs.live_page import go, live_page, swim
+from rigs.live_page import RESOLVED, go, live_page, name_device, swim
 from rigs.processes import Daemon, running, wait_until
 from rigs.virtual_pi_process import Pi
-from rigs.window_process import NETWORK_HOST, WindowProcess
+from rigs.window_process import WindowProcess
 
 pytestmark = needs_browser
 
 AXE = resources.files("axe_playwright_python").joinpath("axe.min.js")
 """The program that looks for barriers."""
 MAX_ASSETS_BYTES = 120_000
-RESOLVED = f"--host-resolver-rules=MAP {NETWORK_HOST} 127.0.0.1"
 
 # Runs in the page: `app` is its own module, with the state that it shows.
 APP = "const app = await import('/app.js');"
@@ -365,12 +364,6 @@ def test_a_device_of_the_network_pairs_with_a_link_that_leaves_its_address(
         assert complaints == []
 
 
-def name_device(page: Page, name: str) -> None:
-    """Give the name for which a page that was opened by a link asks."""
-    page.get_by_label("Name of this device").fill(name)
-    page.get_by_role("button", name="Pair").click()
-
-
 def test_a_device_that_is_revoked_says_so(new_window: WindowProcess) -> None:
     with open_page(new_window.invite()) as (page, _):
         name_device(page, "tablet")
@@ -450,7 +443,7 @@ def test_lost_ticks_are_drawn_as_a_gap_and_suspect_samples_are_marked(
 ) -> None:
     with live_page(window.url) as (page, _):
         lost, row, suspects = page.evaluate("""async () => {
-            const { Ring } = await import("/stream.js");
+            const { Ring } = await import("/ring.js");
             const ring = new Ring(0.05);
             const { charts } = await import("/app.js");
             globalThis.charts = charts;
@@ -479,7 +472,7 @@ def test_lost_ticks_are_drawn_as_a_gap_and_suspect_samples_are_marked(
 def test_a_step_of_the_unix_clock_leaves_the_charts_as_they_are(window: WindowProcess) -> None:
     with live_page(window.url) as (page, _):
         rows, lost, times = page.evaluate("""async () => {
-            const { Ring } = await import("/stream.js");
+            const { Ring } = await import("/ring.js");
             const ring = new Ring(0.05), times = new Array(100);
             for (let seq = 1; seq <= 100; seq++) {
                 ring.push({ t: 1e9 + seq * 0.05 - 30 * (seq > 50), time: seq * 0.05, seq });
@@ -503,10 +496,13 @@ def test_the_memory_of_the_page_is_the_same_after_a_day_of_ticks(window: WindowP
             metrics = session.send("Performance.getMetrics")["metrics"]
             return next(m["value"] for m in metrics if m["name"] == "JSHeapUsedSize") / 1e6
 
+        page.select_option("#seconds", "600")
         page.evaluate("feed(72000, 1000)")
         before = heap()
-        for _ in range(24):
+        for hour in range(24):
             page.evaluate("feed(72000, 1000)")
+            page.click("#pause")  # stands still, or follows again
+            page.select_option("#seconds", ("15", "60", "600")[hour % 3])
         after = heap()
         print(f"JS heap before {before:.1f} MB, after a day {after:.1f} MB")
         assert abs(after - before) <= 5.0
@@ -520,6 +516,17 @@ def test_the_keyboard_reaches_everything_and_the_focus_is_visible(window: Window
             go(page, place)
             expect(page.locator(complete.get(place, "#mode"))).to_be_visible()
             walk(page)
+        go(page, "live")
+        show_chart_tools(page)
+        walk(page)
+
+
+def show_chart_tools(page: Page) -> None:
+    """Let the charts stand still, show their list, and set a cursor."""
+    page.click("#pause")
+    page.get_by_role("button", name="Charts", exact=True).click()
+    page.locator(".plot").first.press("Shift+ArrowLeft")
+    expect(page.locator("#mark-here")).to_be_visible()
 
 
 def walk(page: Page) -> None:
@@ -577,6 +584,8 @@ def test_no_barrier_is_serious(window: WindowProcess) -> None:
             for place in ("experiments", "runs", "fish", "live"):
                 go(page, place)
                 refuse_barriers(page)
+        show_chart_tools(page)
+        refuse_barriers(page)
         page.click("#estop")
         expect(page.locator("#latched")).to_be_visible()
         refuse_barriers(page)
