@@ -36,6 +36,8 @@ _LEVEL, _NOISE = 0.15, 6.0
 this multiple of the usual difference."""
 _MIN_AREA = 0.4
 """Smallest area of a whole fish, relative to the usual one."""
+_MIN_PIXELS = 16
+"""Smallest area of a fish [px]."""
 _END = 0.02
 """Part of the fish's length that is its end."""
 _SMOOTH_S = 1.0
@@ -200,11 +202,11 @@ class FreeFish:
         if self._tag is not None and tag is None:
             return Seen(picture.time, reason="its tag is not seen")
         scale, corner = self._scale, np.zeros(2)
-        labels, best, box = self._find_largest(change, tag, scale, corner)
-        if box[4] < _MIN_AREA * self._area:
+        shape, box = self._find_largest(change, tag, scale, corner)
+        if box[4] < max(_MIN_AREA * self._area, _MIN_PIXELS):
             return Seen(picture.time, reason="no fish is seen")
         first, last = box[:2], box[:2] + box[2:4]
-        if first.min() == 0 or (last == labels.shape[::-1]).any():
+        if first.min() == 0 or (last == shape.shape[::-1]).any():
             return Seen(picture.time, reason="the fish leaves the picture")
         if scale > 1.0 and scale * (last - first).max() < _WIDTH_PX:
             first = np.maximum(0, (scale * (first - 2)).astype(int))
@@ -212,8 +214,10 @@ class FreeFish:
             part = slice(first[1], last[1]), slice(first[0], last[0])
             change = _difference(picture.pixels[part], light, self._whole[part])
             scale, corner = 1.0, first.astype(np.float64)
-            labels, best, _ = self._find_largest(change, tag, scale, corner)
-        rows, columns = np.nonzero(labels == best)
+            shape, _ = self._find_largest(change, tag, scale, corner)
+            if not shape.any():
+                return Seen(picture.time, reason="no fish is seen")
+        rows, columns = np.nonzero(shape)
         points = np.stack([columns, rows], axis=1).astype(np.float64)
         weight = np.clip(change[rows, columns] / self._contrast, 0.0, 1.0)
         place = np.average(points, axis=0, weights=weight)
@@ -245,8 +249,8 @@ class FreeFish:
 
     def _find_largest(
         self, change: Floats, tag: Array | None, scale: float, corner: Array
-    ) -> tuple[NDArray[np.int32], int, NDArray[np.int32]]:
-        """Return labels of what differs, the label of the largest, and its box and area.
+    ) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
+        """Return where the largest thing that differs is, and its box and area.
 
         scale, corner: pixels of the picture for one of `change`, and its place in the picture
         """
@@ -257,9 +261,10 @@ class FreeFish:
             outline = (outline + 0.5) / scale - 0.5
             cv2.fillConvexPoly(mask, np.rint(outline).astype(np.int32), 1)
         _, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
-        best = int(stats[1:, cv2.CC_STAT_AREA].argmax()) + 1 if len(stats) > 1 else 0
-        box = stats[best] if best else np.zeros(5, np.int32)
-        return np.asarray(labels, np.int32), best, np.asarray(box, np.int32)
+        if len(stats) == 1:
+            return mask > 0, np.zeros(5, np.int32)
+        best = int(stats[1:, cv2.CC_STAT_AREA].argmax()) + 1
+        return np.asarray(labels == best), np.asarray(stats[best], np.int32)
 
     def _find_tag(self, picture: Pixels) -> Array | None:
         """Return the corners of the tag, clockwise from its upper left one."""
@@ -283,9 +288,9 @@ def _find_midline(points: Array, along: Array) -> Array:
     low, high = along.min(), along.max()
     reach = _END * (high - low)
     station = np.rint((along - low) / (high - low) * (MIDLINE_POINTS - 1)).astype(int)
-    count = np.maximum(np.bincount(station, minlength=MIDLINE_POINTS), 1)
+    count = np.bincount(station, minlength=MIDLINE_POINTS)
     sums = [np.bincount(station, values, minlength=MIDLINE_POINTS) for values in points.T]
-    midline = np.stack(sums, axis=1) / count[:, None]
+    midline = np.stack(sums, axis=1) / np.where(count, count, np.nan)[:, None]
     midline[0] = points[along < low + reach].mean(axis=0)
     midline[-1] = points[along > high - reach].mean(axis=0)
     return midline
@@ -307,12 +312,10 @@ def _find_ground(pictures: NDArray[np.uint8]) -> Floats:
     nearest = np.abs(some - level).argmin(axis=0)
     ground = np.take_along_axis(some, nearest[None], axis=0)[0].astype(np.float32)
     is_like_fish = np.abs(ground - np.median(fish[moving])) < np.abs(ground - level)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(is_like_fish.astype(np.uint8))
+    _, labels = cv2.connectedComponents(is_like_fish.astype(np.uint8))
     near = np.unique(labels[cv2.dilate(moving.astype(np.uint8), np.ones((5, 5))) > 0])
-    left, top, width, height, _ = stats.T
-    inside = (np.minimum(left, top) > 0) & (left + width < moving.shape[1])
-    inside &= top + height < moving.shape[0]  # else it may be the wall of the tank
-    body = np.isin(labels, [label for label in near if label and inside[label]]).astype(np.uint8)
+    beyond = [0, *labels[[0, -1]].ravel(), *labels[:, [0, -1]].ravel()]  # the wall of a tank
+    body = np.isin(labels, np.setdiff1d(near, beyond)).astype(np.uint8)
     body = np.asarray(cv2.dilate(body, np.ones((9, 9))), np.uint8)
     filled = cv2.inpaint(_to_levels(ground), body, 3.0, cv2.INPAINT_TELEA)
     return np.where(body > 0, filled, ground)

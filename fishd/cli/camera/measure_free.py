@@ -71,14 +71,9 @@ def measure_free(path: Path, options: VideoOptions, *, as_json: bool) -> int:
         draw_swim(path.name, swim, example and (example[0].pixels, example[1]), options.picture)
     pictures, known = len(swim.times), int(np.count_nonzero(np.isfinite(swim.tail)))
     if as_json:
-        values: dict[str, Any] = {
-            "pictures": pictures,
-            "known": known,
-            "unknown": reasons,
-            "beats": swim.beats,
-        }
+        values: dict[str, Any] = {"pictures": pictures, "known": known, "unknown": reasons}
         values |= {"unit": unit, "length": swim.length, "table": str(table.path)}
-        values["problem"] = swim.problem or None
+        values |= {"beats": swim.beats, "problem": swim.problem or None}
         for name in ("mean_speed", "frequency", "excursion", "strouhal"):
             values[name], values[f"{name}_ci95"] = getattr(swim, name) or (None, None)
         print_json(values)
@@ -129,9 +124,8 @@ def _to_rows(
         cells += ["" if math.isnan(value) else f"{value:.6g}" for value in values[1:-1]]
         cells.append(row[_REASON])
         if options.has_midline:  # from the head
-            points = np.array([float(cell or math.nan) for cell in row[_REASON + 1 :]]).reshape(
-                2, -1
-            )
-            points = swim.scale * (points[:, ::-1] if values[-1] else points)
+            numbers = [float(cell or math.nan) for cell in row[_REASON + 1 :]]
+            points = swim.scale * np.array(numbers).reshape(2, -1)
+            points = points[:, ::-1] if values[-1] else points
             cells += [format_cell(value, 3) for value in points.ravel()]
         yield cells

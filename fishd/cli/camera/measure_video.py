@@ -70,24 +70,9 @@ class VideoOptions(NamedTuple):
 
     def refuse(self) -> None:
         """Raise `UsageError` if one of them was given; call this without a video."""
-        for name, value in zip(_NAMES, self, strict=True):
-            if value is not None:
-                raise click.UsageError(f"{name} is for a VIDEO")
-
-
-_NAMES = (
-    "--rate",
-    "--rotate",
-    "--learned",
-    "--with",
-    "--length",
-    "--to",
-    "--plot",
-    "--free",
-    "--tag",
-    "--read-out",
-    "--midline",
-)
+        for parameter in click.get_current_context().command.params:
+            if getattr(self, parameter.name or "", None) is not None:
+                raise click.UsageError(f"{parameter.opts[0]} is for a VIDEO")
 
 
 def video_options(function: F) -> F:
