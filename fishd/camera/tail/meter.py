@@ -98,7 +98,8 @@ class TailMeter:
         self._fin_length = learned.length * (last - first)
         low, high = learned.span
         self._span = _SPAN * low - 0.05, _SPAN * high + 0.05
-        self._is_light = learned.is_light
+        swept = learned.background_picture()[learned.swept_mask()]
+        self._hides_lamps = learned.is_light or float(np.median(swept)) >= SATURATED
         width = learned.size[0]
         self._max_error = max(_MAX_SHAPE_ERROR * width, _USUAL * learned.shape_error)
         self._max_difference = min(
@@ -180,7 +181,7 @@ class TailMeter:
 
         lag: time from the exposure of the fin to that of each station [s]
         """
-        weight = trace.weight if self._is_light else trace.weight * ~trace.glaring
+        weight = trace.weight if self._hides_lamps else trace.weight * ~trace.glaring
         fin = weight[self._fin]
         if fin.sum() < _MIN_FIN_SEEN * len(fin):
             return None
@@ -319,7 +320,7 @@ class TailMeter:
 
     def _find_lamp(self, small: Pixels, places: Array) -> str:
         """Return where a lamp is mirrored on the tail; empty if none is."""
-        if self._is_light:
+        if self._hides_lamps:
             return ""
         lamp = (small >= SATURATED).astype(np.uint8)
         inside = np.zeros_like(lamp)

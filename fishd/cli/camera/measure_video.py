@@ -370,7 +370,10 @@ def _print_result(
     times, angles = measured.times, measured.angles
     beats = find_maxima(times.tolist(), [None if math.isnan(a) else a for a in angles.tolist()])
     mean = average(beats)
-    frequency = 1.0 / float(np.median(np.diff([beat.time for beat in beats]))) if mean else None
+    periods = np.diff([beat.time for beat in beats])
+    # Between neighbours no beat is unknown.
+    periods = periods[periods < [3.0 * (beat.back - beat.time) for beat in beats[:-1]]]
+    frequency = 1.0 / float(np.median(periods)) if len(periods) else None
     if options.picture:
         from fishd.lab.fin_angle_figure import draw_fin_angle
 
@@ -402,7 +405,8 @@ def _print_result(
         *(("", f"{count}: {why}") for why, count in measured.reasons.most_common(_MAX_REASONS)),
         (
             "maximum",
-            f"{text.format_measured(*mean, 'rad')} in {len(beats)} beats, {frequency:.3f} Hz"
+            f"{text.format_measured(*mean, 'rad')} in {len(beats)} beats"
+            + (f", {frequency:.3f} Hz" if frequency else "")
             if mean
             else "fewer than two whole beats are seen",
         ),

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pandas
 import pytest
+from msgspec.structs import replace
 from rigs.filmed_swim import swum
 from rigs.filmed_tail import Film, FilmedTail, rest_before, sine
 from rigs.filmed_video import film_video, write_video
@@ -18,8 +19,10 @@ from rigs.processes import fishctl, one_line
 from rigs.recordings import write
 from scipy.interpolate import CubicSpline
 
+from fishd.camera.tail.meter import TailMeter
 from fishd.camera.video_table import CannotWriteTable, VideoTable
 from fishd.core.signals import Tick
+from fishd.core.tail_reading import TailReading
 
 pytestmark = pytest.mark.slow
 BEGIN, SECONDS = 1.25, 8.0
@@ -160,6 +163,22 @@ def test_the_rows_of_a_rolling_shutter_have_their_own_times(tmp_path: Path) -> N
     assert np.ptp(late) > 2e-3
     error = table.fin_angle - camera.alpha(table.video_time.to_numpy())
     assert error.std() < 4e-3
+
+
+def test_unknown_beats_do_not_lower_the_frequency(
+    video: Path, measured: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, frequency = TailMeter.read, measured[1]["frequency"]
+
+    def read_half(meter: TailMeter, time: float, *rest: Any) -> TailReading:
+        reading = read(meter, time, *rest)
+        return reading if time * frequency % 2.0 < 1.4 else replace(reading, alpha=None)
+
+    monkeypatch.setattr(TailMeter, "read", read_half)
+    learned = "--learned", measured[2] / "fish.bin"
+    result = json.loads(measure(video, tmp_path / "fish.csv", "--json", *learned).stdout)
+    assert 2 <= result["beats"] < 0.7 * measured[1]["beats"]
+    assert result["frequency"] in (None, pytest.approx(frequency, rel=0.1))
 
 
 def test_the_rate_of_the_command_line_replaces_that_of_the_file(

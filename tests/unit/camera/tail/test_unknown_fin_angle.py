@@ -74,6 +74,14 @@ def test_a_turn_is_seen_in_rough_water(fault: dict[str, Any]) -> None:
     assert not any(reading.alpha is not None for reading in readings if reading.time > 6.1)
 
 
+def test_the_light_behind_a_tail_is_not_taken_for_a_mirrored_lamp() -> None:
+    film = Film(water=275.0)
+    readings = measure(replace(film, bend=0.3), learn(film), 4.0, 5.0)
+    reasons = {reading.reason for reading in readings}
+    assert NO_SHAPE in reasons
+    assert not any("lamp" in reason for reason in reasons)
+
+
 def test_a_tail_that_leaves_the_picture_is_lost_at_a_side() -> None:
     film = Film(height=250, motion=rest_before(1.0, sine(0.3)))
     wide = replace(film, motion=sine(0.37), root=(0.22, 0.03))
