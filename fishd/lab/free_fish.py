@@ -31,7 +31,7 @@ _UNCOVERED = 0.9
 """Quantile of the grey levels of a place that shows the ground, beginning with the fish's."""
 _MIN_CONTRAST = 12.0
 """Smallest difference of the fish from the ground [grey levels]."""
-_LEVEL, _NOISE = 0.15, 6.0
+_LEVEL, _NOISE = 0.2, 6.0
 """Difference that belongs to the fish, with its thin tail: at least this part of its contrast, and
 this multiple of the usual difference."""
 _MIN_AREA = 0.4
@@ -369,7 +369,8 @@ def describe_swim(
             np.sort([beat.time for beat in one] + [beat.back for beat in other])
             for one, other in ((tops, backs), (backs, tops))
         ]
-        turns = [turn[np.diff(turn, prepend=-np.inf) > 0.5 * step] for turn in turns]
+        half = float(np.median([beat.back - beat.time for beat in tops + backs] or [0.0]))
+        turns = [turn[np.diff(turn, prepend=-np.inf) > 0.5 * half] for turn in turns]  # seen twice
         begins = np.concatenate([turn[:-1] for turn in turns])
         ends = np.concatenate([turn[1:] for turn in turns])
         if not len(begins):
