@@ -34,7 +34,11 @@ def measure_free(path: Path, options: VideoOptions, *, as_json: bool) -> int:
     """Find the fish in each picture, write the table and print the result."""
     from fishd.lab.free_fish import FreeFish, FreeGround, NoSwim, describe_swim, learn_ground
 
-    for name, value in (("--learned", options.learned), ("--with", options.recording)):
+    for name, value in (
+        ("--learned", options.learned),
+        ("--lens", options.lens),
+        ("--with", options.recording),
+    ):
         if value is not None:
             raise click.UsageError(f"{name} is for a fish whose tail is measured, without --free")
     example: tuple[VideoPicture, Seen] | None = None

@@ -24,7 +24,8 @@ from fishd.core.tail_reading import MIDLINE_POINTS
 if TYPE_CHECKING:
     from fishd.camera.latency import Force
     from fishd.camera.tail.learned import Learned
-    from fishd.camera.video import Turn, Video, VideoPicture
+    from fishd.camera.tail.lens import Turn
+    from fishd.camera.video import Video, VideoPicture
     from fishd.camera.video_table import VideoTable
     from fishd.core.tail_reading import TailReading
     from fishd.lab.fin_angle_figure import Example
@@ -59,6 +60,7 @@ class VideoOptions(NamedTuple):
     rate: float | None
     turn: "Turn | None"
     learned: Path | None
+    lens: Path | None
     recording: str | None
     length_mm: float | None
     target: Path | None
@@ -135,6 +137,7 @@ def video_options(function: F) -> F:
             "--learned",
             about="tail that was learned before, by fishd-camera or with --learn, which writes it.",
         ),
+        file_option("--lens", about="calibration of its lens, by 'fishctl camera lens'."),
         click.option(
             "--rotate",
             "turn",
@@ -293,16 +296,25 @@ def _find_learned(
 ) -> "Learned":
     """Return the tail of the file, of the unfinished table, or learned from the video."""
     from fishd.camera.tail.learned import Learned
+    from fishd.camera.tail.lens import Lens
     from fishd.camera.video import learn as learn_from
 
+    lens = Lens.load(options.lens) if options.lens else None
+    if lens:
+        lens.check(video.size, options.turn or 0)
     if options.learned and not learn:
         learned = Learned.load(options.learned)
         learned.check_size(*video.size)
+        if lens:
+            learned.check_lens(lens)
+        if learned.lens:
+            learned.lens.check(video.size, options.turn or 0)
         return learned.with_length(options.length_mm)
     if table.learned:
+        table.learned.check_lens(lens)
         return table.learned
     with show_waiting("learning the tail"):
-        learned, begin = learn_from(video)
+        learned, begin = learn_from(video, lens)
     learned = learned.with_length(options.length_mm)
     echo(
         f"fishctl: the tail is learned from {begin:.0f} s of the video on, its zero is known to "
@@ -337,7 +349,6 @@ def _measure_pictures(
 
 
 def _to_row(reading: "TailReading", learned: "Learned", *, has_midline: bool) -> list[str]:
-    from fishd.camera.tail.profile import Pose
     from fishd.camera.video_table import format_cell
 
     row = [format_cell(value, 6) for value in (reading.time, reading.alpha, reading.uncertainty)]
@@ -346,8 +357,7 @@ def _to_row(reading: "TailReading", learned: "Learned", *, has_midline: bool) ->
     if scale := learned.pixels_per_mm:
         places: Sequence[float | None] = (None, None)
         if reading.tip:
-            pose = Pose(learned.root, learned.direction)
-            places = (pose.to_axis(np.array(reading.tip)) / scale).tolist()
+            places = (learned.to_axis(np.array(reading.tip)) / scale).tolist()
         row += [format_cell(value, 3) for value in places]
     if has_midline:
         points = np.array(reading.midline or [(math.nan, math.nan)] * MIDLINE_POINTS)
