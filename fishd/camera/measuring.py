@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fishd.camera.messages import TailCondition, TailMessage
+from fishd.camera.picture import turn_read_out
 from fishd.camera.settings import CameraSettings
 from fishd.camera.tail.learned import Learned
 from fishd.camera.tail.learner import Learner
@@ -59,12 +60,9 @@ class Measuring:
         publish: called in the thread with each result
         """
         self._settings = settings.tail
-        read_out, turn = settings.tail.read_out, settings.picture.rotate
-        self._row_time = {0: read_out, 180: -read_out}.get(turn, 0.0)
-        self._column_time = {90: -read_out, 270: read_out}.get(turn, 0.0)
-        """Time between the exposures of the first and the last row, or column, once turned [s]."""
+        self._read_out = turn_read_out(settings.tail.read_out, settings.picture)
         self._path, self._lens_path = path, path.with_suffix(".lens.json")
-        self._rotate = turn
+        self._rotate = settings.picture.rotate
         self._publish = publish
         self._changed = threading.Condition()
         self._picture: _Picture | None = None
@@ -198,7 +196,7 @@ class Measuring:
             self._meter, self._session = TailMeter(learned), picture.session
         if self._meter is None:
             return
-        reading = self._meter.read(picture.time, picture.pixels, self._row_time, self._column_time)
+        reading = self._meter.read(picture.time, picture.pixels, *self._read_out)
         self.measured += 1
         self._measuring_problem = ""
         fields = {name: getattr(reading, name) for name in reading.__struct_fields__}

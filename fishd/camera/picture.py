@@ -31,6 +31,19 @@ def rotate(picture: Pixels, settings: PictureSettings) -> Pixels:
     return picture if turn is None else np.asarray(cv2.rotate(picture, turn), np.uint8)
 
 
+def turn_read_out(read_out: float, settings: PictureSettings) -> tuple[float, float]:
+    """Return the time from the exposure of the first row of a turned picture to that of the last.
+
+    The second value is the same for the columns, of a picture that was turned by 90° [s].
+    read_out: of the picture before it was turned [s]
+    """
+    turn = settings.rotate
+    return (
+        {0: read_out, 180: -read_out}.get(turn, 0.0),
+        {90: -read_out, 270: read_out}.get(turn, 0.0),
+    )
+
+
 def crop(picture: Pixels, settings: PictureSettings) -> tuple[Pixels, Crop]:
     """Return the square of a turned picture that frames show, and its place."""
     height, width = picture.shape

@@ -14,7 +14,7 @@ os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file"
 import cv2
 import numpy as np
 
-from fishd.camera.picture import rotate
+from fishd.camera.picture import rotate, turn_read_out
 from fishd.camera.settings import PictureSettings
 from fishd.camera.tail.learned import Learned
 from fishd.camera.tail.learner import CannotLearn, Learner
@@ -49,10 +49,13 @@ class VideoPicture(NamedTuple):
 class Video:
     """Video file; a context manager. Each call of `pictures` reads it from its begin."""
 
-    def __init__(self, path: Path, rate: float | None = None, turn: Turn = 0) -> None:
+    def __init__(
+        self, path: Path, rate: float | None = None, turn: Turn = 0, read_out: float = 0.0
+    ) -> None:
         """
         rate: pictures a second; None for the times that the file states
         turn: rotation after which the fish's head is at the left
+        read_out: time from the exposure of a picture's first row to that of its last one [s]
 
         Raises `CannotReadVideo`.
         """
@@ -82,6 +85,13 @@ class Video:
                 "as --rate 30"
             )
         self.rate = rate or stated
+        if read_out * self.rate > 1.0:
+            raise CannotReadVideo(
+                f"{self.shown}: --read-out must not exceed {1e3 / self.rate:.4g} ms, the time from "
+                "one picture to the next"
+            )
+        self.read_out = turn_read_out(read_out, self._turn)
+        """Time from the first row to the last one of a turned picture, and of its columns [s]."""
 
     def __enter__(self) -> Self:
         return self

@@ -10,6 +10,10 @@ Point = tuple[float, float]
 """Place in a turned picture: column and row of the centre of a pixel [px]."""
 
 
+MIDLINE_POINTS = 16
+"""Number of points of a midline."""
+
+
 class TailReading(Struct, frozen=True, kw_only=True):
     """What one picture shows of the tail.
 

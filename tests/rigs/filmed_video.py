@@ -38,6 +38,8 @@ class FilmedFish:
     width: int = 400
     height: int = 240
     speed: float = 60.0
+    begin: tuple[float, float] = (60.0, 90.0)
+    """Column and row of its place at first."""
     turn: float = 0.1
     """Rate of its heading, anticlockwise [rad/s]."""
     frequency: float = 2.5
@@ -54,7 +56,7 @@ class FilmedFish:
     def place(self, time: float) -> NDArray[np.float64]:
         h = self.heading(np.linspace(0.0, time, 60))  # type: ignore[arg-type]
         ahead = np.stack([np.cos(h), np.sin(h)], axis=1).mean(axis=0)
-        return np.array([60.0, 90.0]) + self.speed * time * ahead
+        return np.array(self.begin) + self.speed * time * ahead
 
     def _outline(self, time: float) -> NDArray[np.float64]:
         """Return the outline with the head to the right."""

@@ -30,6 +30,8 @@ class Beat(NamedTuple):
     """Half of the swing from peak to peak [rad]."""
     middle: float
     """Middle of the swing [rad]."""
+    back: float = 0.0
+    """Time of the reversal on the negative side, which follows [s]."""
 
 
 def find_maxima(time: Sequence[float], alpha: Iterable[float | None]) -> list[Beat]:
@@ -58,7 +60,7 @@ def find_maxima(time: Sequence[float], alpha: Iterable[float | None]) -> list[Be
         bottom = _find_vertex(times, -angles, slice(turn, end), period, usual)
         if top is not None and bottom is not None:
             swing, middle = top[1] + bottom[1], top[1] - bottom[1]
-            beats.append(Beat(top[0], 0.5 * swing, 0.5 * middle))
+            beats.append(Beat(top[0], 0.5 * swing, 0.5 * middle, bottom[0]))
     return beats
 
 

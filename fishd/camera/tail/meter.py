@@ -28,7 +28,7 @@ from fishd.camera.tail.profile import (
 from fishd.camera.tail.scene import Scene
 from fishd.camera.tail.shape import Fit, Shape
 from fishd.core.camera_frames import Pixels
-from fishd.core.tail_reading import TailReading
+from fishd.core.tail_reading import MIDLINE_POINTS, TailReading
 
 _MIN_LENGTH = 0.55
 """Shortest part of the tail that must be seen."""
@@ -87,8 +87,6 @@ _SPAN = 1.25
 _MIN_REPEATED_RATE, _STOP_S = 0.3, 0.15
 """Recent speed of the fin above which two equal pictures are one that the camera repeats [rad/s],
 and the time constant with which it is forgotten, as a fin cannot stop at once [s]."""
-MIDLINE_POINTS = 16
-"""Number of points of a midline."""
 
 
 class _Seen(NamedTuple):
@@ -121,7 +119,8 @@ class TailMeter:
         self._fin_length = learned.length * (last - first)
         low, high = learned.span
         self._span = _SPAN * low - 0.05, _SPAN * high + 0.05
-        self._is_light = learned.is_light
+        swept = learned.background_picture()[learned.swept_mask()]
+        self._hides_lamps = learned.is_light or float(np.median(swept)) >= SATURATED
         width = learned.size[0]
         self._max_error = max(_MAX_SHAPE_ERROR * width, _USUAL * learned.shape_error)
         self._max_difference = min(
@@ -213,7 +212,7 @@ class TailMeter:
 
         lag: time from the exposure of the fin to that of each station [s]
         """
-        weight = trace.weight if self._is_light else trace.weight * ~trace.glaring
+        weight = trace.weight if self._hides_lamps else trace.weight * ~trace.glaring
         fin = weight[self._fin]
         if fin.sum() < _MIN_FIN_SEEN * len(fin):
             return None
@@ -385,7 +384,7 @@ class TailMeter:
 
     def _find_lamp(self, small: Pixels, places: Array) -> str:
         """Return where a lamp is mirrored on the tail; empty if none is."""
-        if self._is_light:
+        if self._hides_lamps:
             return ""
         lamp = (small >= SATURATED).astype(np.uint8)
         inside = np.zeros_like(lamp)

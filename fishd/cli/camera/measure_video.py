@@ -1,16 +1,15 @@
 """Measurement of the fin angle in a video file, for `fishctl camera measure VIDEO`."""
 
 import math
-import re
 from collections import Counter
-from collections.abc import Callable
-from contextlib import ExitStack
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import click
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from fishd.cli.options import F, FiniteRange, plot_option
@@ -20,13 +19,15 @@ from fishd.core import text
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError
 from fishd.core.process.interruption import raise_on_first_signal
+from fishd.core.tail_reading import MIDLINE_POINTS
 
 if TYPE_CHECKING:
     from fishd.camera.latency import Force
     from fishd.camera.tail.learned import Learned
     from fishd.camera.tail.lens import Turn
-    from fishd.camera.tail_table import TailTable
-    from fishd.camera.video import Video
+    from fishd.camera.video import Video, VideoPicture
+    from fishd.camera.video_table import VideoTable
+    from fishd.core.tail_reading import TailReading
     from fishd.lab.fin_angle_figure import Example
     from fishd.lab.video_clock import ClockOffset
 
@@ -35,7 +36,22 @@ WARM_UP_S = 2.0
 _MAX_REASONS = 4
 """Largest number of reasons for unknown fin angles that are printed."""
 
+_COLUMNS = ("video_time", "fin_angle", "fin_angle_uncertainty", "tip_column", "tip_row", "reason")
+_MM_COLUMNS = ("tip_along_mm", "tip_across_mm")
+
 Array = NDArray[np.float64]
+Knowledge = TypeVar("Knowledge", bound=Struct)
+
+
+class _Measured(NamedTuple):
+    """All fin angles of a video."""
+
+    times: Array
+    """Times of the pictures [s]."""
+    angles: Array
+    """Fin angles, NaN where unknown [rad]."""
+    reasons: Counter[str]
+    """Number of pictures by the reason why the angle is unknown."""
 
 
 class VideoOptions(NamedTuple):
@@ -51,26 +67,14 @@ class VideoOptions(NamedTuple):
     picture: Path | None
     free: bool | None
     tag: int | None
+    read_out_ms: float | None
+    has_midline: bool | None
 
     def refuse(self) -> None:
         """Raise `UsageError` if one of them was given; call this without a video."""
-        for name, value in zip(_NAMES, self, strict=True):
-            if value is not None:
-                raise click.UsageError(f"{name} is for a VIDEO")
-
-
-_NAMES = (
-    "--rate",
-    "--rotate",
-    "--learned",
-    "--lens",
-    "--with",
-    "--length",
-    "--to",
-    "--plot",
-    "--free",
-    "--tag",
-)
+        for parameter in click.get_current_context().command.params:
+            if getattr(self, parameter.name or "", None) is not None:
+                raise click.UsageError(f"{parameter.opts[0]} is for a VIDEO")
 
 
 def video_options(function: F) -> F:
@@ -82,6 +86,22 @@ def video_options(function: F) -> F:
 
     positive = FiniteRange(min=0.0, max=1e5, min_open=True)
     decorators: list[Callable[[Any], Any]] = [
+        click.option(
+            "--midline",
+            "has_midline",
+            is_flag=True,
+            default=None,
+            help=f"For a VIDEO: add {MIDLINE_POINTS} points of the midline to the table, from "
+            "root, or head, to tip.",
+        ),
+        click.option(
+            "--read-out",
+            "read_out_ms",
+            type=FiniteRange(min=0.0, max=200.0),
+            metavar="MS",
+            help="For a VIDEO: time from the exposure of a picture's first row to that of its last "
+            "one, of a rolling shutter [ms; default: 0].",
+        ),
         click.option(
             "--tag",
             type=click.IntRange(0, 586),
@@ -96,7 +116,7 @@ def video_options(function: F) -> F:
             help="For a VIDEO: the whole fish swims; measure its place, heading, speed, tail beat "
             "and Strouhal number. --length is that of the fish.",
         ),
-        plot_option("for a VIDEO: fin angle, its maxima, and two pictures with the midline,"),
+        plot_option("for a VIDEO: a picture with the midline, and the motion over time,"),
         file_option("--to", "target", about="write the table, a row a picture, to this .csv file."),
         click.option(
             "--length",
@@ -136,36 +156,29 @@ def video_options(function: F) -> F:
     return function
 
 
-class _Measured(NamedTuple):
-    """All fin angles of a video."""
-
-    times: Array
-    """Times of the pictures [s]."""
-    angles: Array
-    """Fin angles, NaN where unknown [rad]."""
-    reasons: Counter[str]
-    """Number of pictures by the reason why the angle is unknown."""
+def name_midline(unit: str) -> tuple[str, ...]:
+    """Return the names of the columns of a midline: all along the rows, then all across."""
+    return tuple(f"{axis}{point}_{unit}" for axis in "xy" for point in range(MIDLINE_POINTS))
 
 
-def measure_video(path: Path, options: VideoOptions, *, learn: bool, as_json: bool) -> int:
-    """Measure the fin angle in each picture, write the table and print the result.
+@contextmanager
+def open_table(
+    path: Path, options: VideoOptions, kind: type[Knowledge]
+) -> "Iterator[tuple[Video, VideoTable[Knowledge]]]":
+    """Yield a video and its unfinished table.
 
-    learn: whether the tail is learned from this video and written to `options.learned`
+    kind: of what is learned from the video before it is measured
     """
-    from fishd.camera.tail_table import Source, TailTable
     from fishd.camera.video import Video
+    from fishd.camera.video_table import Source, VideoTable
     from fishd.lab import drawing
 
     if options.target is None:
         raise click.UsageError("--to FILE.csv is needed for the table of a VIDEO")
-    if learn and options.learned is None:
-        raise click.UsageError("--learn needs --learned FILE for what is learned from a VIDEO")
     if options.picture:
         drawing.check(options.picture)
-    forces = _read_recording(options.recording) if options.recording else None
-    turn = options.turn or 0
-    with ExitStack() as stack:
-        video = stack.enter_context(Video(path, options.rate, turn))
+    turn, read_out = options.turn or 0, 1e-3 * (options.read_out_ms or 0.0)
+    with Video(path, options.rate, turn, read_out) as video:
         status = path.stat()
         source = Source(
             video=str(path.resolve()),
@@ -173,19 +186,72 @@ def measure_video(path: Path, options: VideoOptions, *, learn: bool, as_json: bo
             modified=status.st_mtime_ns,
             rate=options.rate,
             turn=turn,
+            read_out=read_out,
             length_mm=options.length_mm,
+            is_free=bool(options.free),
+            tag=options.tag,
+            has_midline=bool(options.has_midline),
         )
-        table = stack.enter_context(TailTable(options.target, source))
-        try:
-            with raise_on_first_signal():
-                table.begin(_find_learned(video, table, options, learn=learn))
-                examples = _measure_pictures(video, table)
-        except KeyboardInterrupt:
-            done = f"{table.rows} pictures are measured; the same command goes on"
-            echo(f"fishctl: interrupted, {done}", err=True)
-            return INTERRUPTED
-        measured = _read_angles(table)
-        clock = None
+        with VideoTable(options.target, source, kind) as table:
+            yield video, table
+
+
+@contextmanager
+def resumable(table: "VideoTable[Any]") -> Iterator[None]:
+    """End the verb after Ctrl-C, and say that the same command goes on."""
+    try:
+        with raise_on_first_signal():
+            yield
+    except KeyboardInterrupt:
+        done = f"{table.rows} pictures are measured; the same command goes on"
+        echo(f"fishctl: interrupted, {done}", err=True)
+        raise click.exceptions.Exit(INTERRUPTED) from None
+
+
+def add_rows(
+    video: "Video",
+    table: "VideoTable[Any]",
+    measure: "Callable[[VideoPicture], Sequence[str]]",
+    warm_up: float = 0.0,
+) -> None:
+    """Add the missing rows to a table; warm_up: time before them to measure again [s]."""
+    with ExitStack() as stack:
+        show = Lines(err=True)
+        if video.count:
+            show = stack.enter_context(show_progress(video.count, "pictures", err=True))
+        for picture in video.pictures(max(0, table.rows - round(warm_up * video.rate))):
+            row = measure(picture)
+            if picture.number >= table.rows:
+                table.add(row)
+            show.at(picture.number + 1)
+    if table.rows < video.count - video.rate:
+        echo(
+            f"fishctl: {video.shown} ends after {table.rows} of {video.count} pictures: it is "
+            "damaged",
+            err=True,
+        )
+
+
+def measure_video(path: Path, options: VideoOptions, *, learn: bool, as_json: bool) -> int:
+    """Measure the fin angle in each picture, write the table and print the result.
+
+    learn: whether the tail is learned from this video and written to `options.learned`
+    """
+    from fishd.camera.tail.learned import Learned
+
+    if learn and options.learned is None:
+        raise click.UsageError("--learn needs --learned FILE for what is learned from a VIDEO")
+    with open_table(path, options, Learned) as (video, table):
+        forces = _read_recording(options.recording) if options.recording else None
+        with resumable(table):
+            learned = _find_learned(video, table, options, learn=learn)
+            table.begin(learned)
+            examples = _measure_pictures(video, table, learned)
+        numbers, reasons = table.read_numbers((0, 1), reason=5)
+        measured = _Measured(numbers[0], numbers[1], reasons)
+        columns = _COLUMNS + (_MM_COLUMNS if learned.pixels_per_mm else ())
+        columns += name_midline("px") if options.has_midline else ()
+        clock, rows = None, table.read()
         if forces:
             from fishd.lab.video_clock import NoOffset, find_offset
 
@@ -196,15 +262,16 @@ def measure_video(path: Path, options: VideoOptions, *, learn: bool, as_json: bo
                     f"{text.quoted(options.recording or '')}: {error}; without --with, the same "
                     "command writes the table"
                 ) from None
-            table.finish(("elapsed",), partial(_to_elapsed, clock))
-        else:
-            table.finish()
-        _print_result(video, table, measured, clock, options, examples, as_json=as_json)
+            columns += ("elapsed",)
+            rows = ([*row, _to_elapsed(clock, row)] for row in rows)
+        table.finish(columns, rows)
+        zero_ci95 = learned.zero_ci95
+        _print_result(video, zero_ci95, measured, clock, options, examples, as_json=as_json)
     return 0
 
 
-def _to_elapsed(clock: "ClockOffset", row: list[str]) -> list[str]:
-    return [f"{float(clock.to_recording(np.array(float(row[0])))):.6f}"]
+def _to_elapsed(clock: "ClockOffset", row: list[str]) -> str:
+    return f"{float(clock.to_recording(np.array(float(row[0])))):.6f}"
 
 
 def _read_recording(name: str) -> "list[Force]":
@@ -225,7 +292,7 @@ def _read_recording(name: str) -> "list[Force]":
 
 
 def _find_learned(
-    video: "Video", table: "TailTable", options: VideoOptions, *, learn: bool
+    video: "Video", table: "VideoTable[Learned]", options: VideoOptions, *, learn: bool
 ) -> "Learned":
     """Return the tail of the file, of the unfinished table, or learned from the video."""
     from fishd.camera.tail.learned import Learned
@@ -259,50 +326,48 @@ def _find_learned(
     return learned
 
 
-def _measure_pictures(video: "Video", table: "TailTable") -> "list[Example]":
+def _measure_pictures(
+    video: "Video", table: "VideoTable[Learned]", learned: "Learned"
+) -> "list[Example]":
     """Add the missing rows to a table; return the pictures with the largest angles."""
     from fishd.camera.tail.meter import TailMeter
     from fishd.lab.fin_angle_figure import Example
 
-    assert table.learned
-    meter, largest = TailMeter(table.learned), dict[int, Example]()
-    begin = max(0, table.rows - round(WARM_UP_S * video.rate))
-    with ExitStack() as stack:
-        show = Lines(err=True)
-        if video.count:
-            show = stack.enter_context(show_progress(video.count, "pictures", err=True))
-        for picture in video.pictures(begin):
-            reading = meter.read(picture.time, picture.pixels)
-            if picture.number >= table.rows:
-                table.add(reading)
-            show.at(picture.number + 1)
-            if reading.alpha is not None:
-                side = 1 if reading.alpha > 0.0 else -1
-                best = largest.get(side)
-                if best is None or side * reading.alpha > side * (best.reading.alpha or 0.0):
-                    largest[side] = Example(picture.pixels, reading)
-    if table.rows < video.count - video.rate:
-        echo(
-            f"fishctl: {video.shown} ends after {table.rows} of {video.count} pictures: it is "
-            "damaged",
-            err=True,
-        )
+    meter, largest = TailMeter(learned), dict[int, Example]()
+
+    def measure(picture: "VideoPicture") -> list[str]:
+        reading = meter.read(picture.time, picture.pixels, *video.read_out)
+        if reading.alpha is not None:
+            side = 1 if reading.alpha > 0.0 else -1
+            best = largest.get(side)
+            if best is None or side * reading.alpha > side * (best.reading.alpha or 0.0):
+                largest[side] = Example(picture.pixels, reading)
+        return _to_row(reading, learned, has_midline=table.source.has_midline)
+
+    add_rows(video, table, measure, WARM_UP_S)
     return list(largest.values())
 
 
-def _read_angles(table: "TailTable") -> _Measured:
-    times, angles, reasons = [], [], Counter[str]()
-    for row in table.read():
-        times.append(float(row[0]))
-        angles.append(float(row[1]) if row[1] else math.nan)
-        if not row[1]:
-            reasons[re.sub(r"\d+", "…", row[5])] += 1
-    return _Measured(np.array(times), np.array(angles), reasons)
+def _to_row(reading: "TailReading", learned: "Learned", *, has_midline: bool) -> list[str]:
+    from fishd.camera.video_table import format_cell
+
+    row = [format_cell(value, 6) for value in (reading.time, reading.alpha, reading.uncertainty)]
+    row += [format_cell(value, 2) for value in reading.tip or (None, None)]
+    row.append(reading.reason)
+    if scale := learned.pixels_per_mm:
+        places: Sequence[float | None] = (None, None)
+        if reading.tip:
+            places = (learned.to_axis(np.array(reading.tip)) / scale).tolist()
+        row += [format_cell(value, 3) for value in places]
+    if has_midline:
+        points = np.array(reading.midline or [(math.nan, math.nan)] * MIDLINE_POINTS)
+        row += [format_cell(value, 2) for value in points.T.ravel()]
+    return row
 
 
 def _print_result(
     video: "Video",
-    table: "TailTable",
+    zero_ci95: float,
     measured: _Measured,
     clock: "ClockOffset | None",
     options: VideoOptions,
@@ -312,11 +377,13 @@ def _print_result(
 ) -> None:
     from fishd.camera.tail.beats import average, find_maxima
 
-    assert table.learned
     times, angles = measured.times, measured.angles
     beats = find_maxima(times.tolist(), [None if math.isnan(a) else a for a in angles.tolist()])
     mean = average(beats)
-    frequency = 1.0 / float(np.median(np.diff([beat.time for beat in beats]))) if mean else None
+    periods = np.diff([beat.time for beat in beats])
+    # Between neighbours no beat is unknown.
+    periods = periods[periods < [3.0 * (beat.back - beat.time) for beat in beats[:-1]]]
+    frequency = 1.0 / float(np.median(periods)) if len(periods) else None
     if options.picture:
         from fishd.lab.fin_angle_figure import draw_fin_angle
 
@@ -328,7 +395,7 @@ def _print_result(
                 "pictures": len(times),
                 "known": known,
                 "unknown": measured.reasons,
-                "zero_ci95": table.learned.zero_ci95,
+                "zero_ci95": zero_ci95,
                 "fin_angle_max": mean[0] if mean else None,
                 "fin_angle_max_ci95": mean[1] if mean else None,
                 "beats": len(beats),
@@ -337,18 +404,19 @@ def _print_result(
                 "video_begin_ci95": clock.begin[1] if clock else None,
                 "clock_stretch": clock.stretch if clock else None,
                 "clock_stretch_ci95": clock.stretch_ci95 if clock else None,
-                "table": str(table.path),
+                "table": str(options.target),
             }
         )
         return
     size = f"{video.size[0]} × {video.size[1]} px"
     rows = [
         ("video", f"{format_count(len(times), 'picture')} of {size}, {video.rate:.4g} a second"),
-        ("fin angle", f"known in {known} of them, zero ± {table.learned.zero_ci95 * 1e3:.1f} mrad"),
+        ("fin angle", f"known in {known} of them, zero ± {zero_ci95 * 1e3:.1f} mrad"),
         *(("", f"{count}: {why}") for why, count in measured.reasons.most_common(_MAX_REASONS)),
         (
             "maximum",
-            f"{text.format_measured(*mean, 'rad')} in {len(beats)} beats, {frequency:.3f} Hz"
+            f"{text.format_measured(*mean, 'rad')} in {len(beats)} beats"
+            + (f", {frequency:.3f} Hz" if frequency else "")
             if mean
             else "fewer than two whole beats are seen",
         ),
@@ -361,4 +429,4 @@ def _print_result(
             ("recording", f"the video begins {begin:.4f} ± {ci95:.4f} s after its first tick"),
             ("", f"the clock of the video is {percent} {pace}"),
         ]
-    echo_rows([*rows, ("table", str(table.path))])
+    echo_rows([*rows, ("table", str(options.target))])

@@ -3,7 +3,6 @@
 import json
 import subprocess
 from collections.abc import Callable
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +10,19 @@ import cv2
 import numpy as np
 import pandas
 import pytest
+from msgspec.structs import replace
 from rigs.filmed_swim import swum
 from rigs.filmed_tail import Film, FilmedTail, rest_before, sine
 from rigs.filmed_video import film_video, write_video
+from rigs.interrupted_table import interrupt_after
 from rigs.processes import fishctl, one_line
 from rigs.recordings import write
 from scipy.interpolate import CubicSpline
 
-from fishd.camera.tail_table import CannotWriteTable, TailTable
+from fishd.camera.tail.meter import TailMeter
+from fishd.camera.video_table import CannotWriteTable, VideoTable
 from fishd.core.signals import Tick
+from fishd.core.tail_reading import TailReading
 
 pytestmark = pytest.mark.slow
 BEGIN, SECONDS = 1.25, 8.0
@@ -101,19 +104,25 @@ def test_the_figure_has_the_midline_in_the_picture(measured: Result) -> None:
     assert np.count_nonzero(green) > 200
 
 
+def test_an_interrupted_measurement_leaves_the_tail_that_it_has_learned(
+    video: Path, measured: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned, target = tmp_path / "fish.bin", tmp_path / "fish.csv"
+    with interrupt_after(0, monkeypatch):
+        measure(video, target, "--learn", "--learned", learned)
+    for words in (("--learned", learned), ("--learn", "--learned", learned)):
+        with interrupt_after(9, monkeypatch):
+            assert "9 pictures are measured" in measure(video, target, *words).stderr
+        (tmp_path / "fish.csv.part").unlink()
+    assert measure(video, target, "--learned", learned).returncode == 0
+    assert pandas.read_csv(target).fin_angle.equals(measured[0].fin_angle)
+
+
 def test_an_interrupted_measurement_goes_on_where_it_ended(
     video: Path, measured: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    add, calls = TailTable.add, count(1)
-
-    def interrupted(table: TailTable, *reading: Any) -> None:
-        if next(calls) > 170:
-            raise KeyboardInterrupt
-        add(table, *reading)
-
     target = tmp_path / "fish.csv"
-    with monkeypatch.context() as patch:
-        patch.setattr(TailTable, "add", interrupted)
+    with interrupt_after(170, monkeypatch):
         done = measure(video, target)
     assert done.returncode == 130
     assert "170 pictures are measured; the same command goes on" in done.stderr
@@ -121,14 +130,55 @@ def test_an_interrupted_measurement_goes_on_where_it_ended(
     with (tmp_path / "fish.csv.part").open("a") as part:
         part.write("5.6666,0.1")  # a row that a kill has torn
     measured_again: list[float] = []
+    add = VideoTable.add
     monkeypatch.setattr(
-        TailTable, "add", lambda *row: measured_again.append(row[1].time) or add(*row)
+        VideoTable, "add", lambda *row: measured_again.append(float(row[1][0])) or add(*row)
     )
     assert measure(video, target).returncode == 0
     assert measured_again[0] == pytest.approx(170 / 30, abs=1e-3)
     resumed, whole = pandas.read_csv(target), measured[0]
     assert resumed.fin_angle.equals(whole.fin_angle)
     assert list(tmp_path.iterdir()) == [target]
+
+
+def test_the_midline_is_added_on_request(video: Path, measured: Result, tmp_path: Path) -> None:
+    learned = "--learned", measured[2] / "fish.bin"
+    assert measure(video, tmp_path / "fish.csv", "--midline", *learned).returncode == 0
+    table = pandas.read_csv(tmp_path / "fish.csv")
+    ends = table[["x15_px", "y15_px"]].to_numpy()
+    assert ends == pytest.approx(table[["tip_column", "tip_row"]].to_numpy(), abs=0.01)
+    x = table[[f"x{k}_px" for k in range(16)]].to_numpy()
+    assert (np.diff(x, axis=1) > 0.0).all()
+    assert table.y0_px.std() < 1.0 < table.y15_px.std()
+
+
+def test_the_rows_of_a_rolling_shutter_have_their_own_times(tmp_path: Path) -> None:
+    film = Film(width=400, height=240, motion=rest_before(0.5, sine(0.2)), read_out=0.03)
+    camera = FilmedTail(film)
+    video = film_video(tmp_path / "fish.avi", camera, 0.0, 4.0)
+    done = measure(video, tmp_path / "fish.csv", "--read-out", "30")
+    assert done.returncode == 0, done.stderr
+    table = pandas.read_csv(tmp_path / "fish.csv")
+    late = table.video_time - np.arange(len(table)) / 30
+    assert np.ptp(late) > 2e-3
+    error = table.fin_angle - camera.alpha(table.video_time.to_numpy())
+    assert error.std() < 4e-3
+
+
+def test_unknown_beats_do_not_lower_the_frequency(
+    video: Path, measured: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, frequency = TailMeter.read, measured[1]["frequency"]
+
+    def read_half(meter: TailMeter, time: float, *rest: Any) -> TailReading:
+        reading = read(meter, time, *rest)
+        return reading if time * frequency % 2.0 < 1.4 else replace(reading, alpha=None)
+
+    monkeypatch.setattr(TailMeter, "read", read_half)
+    learned = "--learned", measured[2] / "fish.bin"
+    result = json.loads(measure(video, tmp_path / "fish.csv", "--json", *learned).stdout)
+    assert 2 <= result["beats"] < 0.7 * measured[1]["beats"]
+    assert result["frequency"] in (None, pytest.approx(frequency, rel=0.1))
 
 
 def test_the_rate_of_the_command_line_replaces_that_of_the_file(
@@ -218,6 +268,11 @@ def test_a_table_that_cannot_be_written_is_refused_before_anything_is_measured(
     assert (tmp_path / "file").read_text() == "kept"
 
 
+def test_a_read_out_longer_than_a_picture_is_refused(video: Path, tmp_path: Path) -> None:
+    done = measure(video, tmp_path / "fish.csv", "--read-out", "40")
+    assert "--read-out must not exceed 33.33 ms, the time from one picture" in one_line(done)
+
+
 def test_an_unfinished_table_of_something_else_is_kept(video: Path, tmp_path: Path) -> None:
     part = tmp_path / "fish.csv.part"
     part.write_text("kept\n")
@@ -236,7 +291,7 @@ def test_rows_from_other_options_are_not_mixed(
         raise CannotWriteTable("the disk is full")
 
     with monkeypatch.context() as patch:
-        patch.setattr(TailTable, "add", full)
+        patch.setattr(VideoTable, "add", full)
         assert "the disk is full" in measure(video, tmp_path / "fish.csv", *learned).stderr
     done = measure(video, tmp_path / "fish.csv", "--rate", "20", *learned)
     assert "is from another video or other options: remove it" in one_line(done)
@@ -270,6 +325,7 @@ def test_a_video_of_another_size_than_the_learned_one_is_refused(
         (("fish.avi", "--to", "a.csv", "--learn"), "--learn needs --learned FILE"),
         (("fish.avi", "--to", "a.csv", "--for", "9"), "--for is for a camera, not for a VIDEO"),
         (("--rate", "30"), "--rate is for a VIDEO"),
+        (("--midline",), "--midline is for a VIDEO"),
     ],
 )
 def test_options_for_something_else_are_refused(words: tuple[str, ...], message: str) -> None:

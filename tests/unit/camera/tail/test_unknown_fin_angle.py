@@ -154,6 +154,14 @@ def test_a_tail_that_leaves_the_picture_is_lost_at_a_side(
     assert find_errors(changed, readings).worst < 0.03
 
 
+def test_the_light_behind_a_tail_is_not_taken_for_a_mirrored_lamp() -> None:
+    film = Film(water=275.0)
+    readings = measure(replace(film, bend=0.3), learn(film), 4.0, 5.0)
+    reasons = {reading.reason for reading in readings}
+    assert NO_SHAPE in reasons
+    assert not any("lamp" in reason for reason in reasons)
+
+
 def test_pictures_of_another_size_are_refused(learned: Learned) -> None:
     reading = TailMeter(learned).read(0.0, FilmedTail(Film(width=320, height=240)).picture(0.0))
     assert reading.alpha is None

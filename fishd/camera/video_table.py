@@ -1,24 +1,27 @@
-"""Table of the fin angles of a video, which a later run of the same command completes."""
+"""Table with a row for each picture of a video, which a later run of the same command completes."""
 
 import csv
 import fcntl
+import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+import re
+from array import array
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Self
+from typing import Generic, Self, TypeVar
 
 import msgspec
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
-from fishd.camera.tail.learned import Learned
 from fishd.core import files
 from fishd.core.errors import FishdError
-from fishd.core.tail_reading import TailReading
 
-COLUMNS = ("video_time", "fin_angle", "fin_angle_uncertainty", "tip_column", "tip_row", "reason")
-MM_COLUMNS = ("tip_along_mm", "tip_across_mm")
 _MAX_HEAD_BYTES = 2**23
+_HEAD_BEGINS = '{"source":{"video":'
+Learned = TypeVar("Learned", bound=Struct)
 
 
 class CannotWriteTable(FishdError, ValueError):
@@ -33,25 +36,33 @@ class Source(Struct, frozen=True, kw_only=True):
     modified: int
     rate: float | None
     turn: int
+    read_out: float
     length_mm: float | None
+    is_free: bool
+    tag: int | None
+    has_midline: bool
 
 
 class _Head(Struct, frozen=True):
     source: Source
-    learned: Learned
+    learned: msgspec.Raw
 
 
-class TailTable:
+class VideoTable(Generic[Learned]):
     """Unfinished table beside the file that `finish` writes; a context manager.
 
     The unfinished file begins with a line that says what its rows are from.
     """
 
-    def __init__(self, path: Path, source: Source) -> None:
-        """Raise `CannotWriteTable` where the file of this path cannot be written."""
-        self.path, self._source = path, source
+    def __init__(self, path: Path, source: Source, kind: type[Learned]) -> None:
+        """Raise `CannotWriteTable` where the file of this path cannot be written.
+
+        kind: of what is learned from the video before the rows are measured
+        """
+        self.path, self.source = path, source
+        self._kind = kind
         self.learned: Learned | None = None
-        """Tail from which the rows are; None in a table that has just begun."""
+        """Ground or tail that the rows are measured with; None in a table that has just begun."""
         self.rows = 0
         """Number of pictures in the table."""
         self.part = path.with_name(path.name + ".part")
@@ -87,28 +98,37 @@ class TailTable:
         """Set `learned` and `rows`, and remove a torn last row."""
         self._file.seek(0)
         line = self._file.readline(_MAX_HEAD_BYTES)
-        if not line:
+        if not line.endswith("\n") and line.startswith(_HEAD_BEGINS[: len(line)]):
+            self._file.truncate(0)  # a kill has torn it
             return
         try:
             head = msgspec.json.decode(line, type=_Head)
+            learned = None
+            if head.source == self.source:
+                learned = msgspec.json.decode(head.learned, type=self._kind)
         except (msgspec.DecodeError, UnicodeError):
             raise CannotWriteTable(
                 f"{self.part} is not an unfinished table: remove it, or give another file with --to"
             ) from None
-        if head.source != self._source:
+        if learned is None:
             raise CannotWriteTable(
                 f"{self.part} is from another video or other options: remove it, or give another "
                 "file with --to"
             )
-        self.learned, end = head.learned, self._file.tell()
+        self.learned, end = learned, self._file.tell()
         while self._file.readline().endswith("\n"):
             self.rows, end = self.rows + 1, self._file.tell()
         self._file.truncate(end)
 
     def begin(self, learned: Learned) -> None:
-        """Store what was learned; raise `CannotWriteTable` if the rows are from another tail."""
+        """Store what was learned; raise `CannotWriteTable` if the rows are from something else."""
         if self.learned is None:
-            self._write(msgspec.json.encode(_Head(self._source, learned)).decode() + "\n")
+            head = _Head(self.source, msgspec.Raw(msgspec.json.encode(learned)))
+            try:
+                self._file.write(msgspec.json.encode(head).decode() + "\n")
+                self._file.flush()
+            except OSError as error:
+                raise self._failed(error) from None
         elif self.learned != learned:
             raise CannotWriteTable(
                 f"{self.part} was measured with another learned tail: remove it, or give another "
@@ -116,26 +136,8 @@ class TailTable:
             )
         self.learned = learned
 
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Names of the columns."""
-        assert self.learned
-        return COLUMNS + (MM_COLUMNS if self.learned.pixels_per_mm else ())
-
-    def add(self, reading: TailReading) -> None:
+    def add(self, row: Sequence[str]) -> None:
         """Append the row of a picture."""
-        assert self.learned
-        tip = reading.tip or (None, None)
-        places: Sequence[float | None] = (None, None)
-        scale = self.learned.pixels_per_mm
-        if scale and reading.tip:
-            places = (self.learned.to_axis(np.array(reading.tip)) / scale).tolist()
-        row = [
-            *(_format(value, 6) for value in (reading.time, reading.alpha, reading.uncertainty)),
-            *(_format(value, 2) for value in tip),
-            reading.reason,
-            *(_format(value, 3) for value in places if scale),
-        ]
         try:
             csv.writer(self._file, lineterminator="\n").writerow(row)
         except OSError as error:
@@ -149,19 +151,28 @@ class TailTable:
             file.readline()
             yield from csv.reader(file)
 
-    def finish(
-        self, names: Sequence[str] = (), more: Callable[[list[str]], list[str]] = lambda _: []
-    ) -> None:
-        """Write the file, and remove the unfinished one; raise `CannotWriteTable`.
+    def read_numbers(
+        self, places: Sequence[int], reason: int
+    ) -> tuple[NDArray[np.float64], Counter[str]]:
+        """Return columns, shape (places, rows), NaN where empty, and how often each reason occurs.
 
-        names: of further columns; more: their values for a row
+        places, reason: numbers of columns. Numbers in reasons are left out.
         """
+        numbers, reasons = array("d"), Counter[str]()
+        for row in self.read():
+            numbers.extend(float(row[place] or math.nan) for place in places)
+            if row[reason]:
+                reasons[re.sub(r"\d+", "…", row[reason])] += 1
+        return np.array(numbers).reshape(-1, len(places)).T, reasons
+
+    def finish(self, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+        """Write the file, and remove the unfinished one; raise `CannotWriteTable`."""
         new = self.path.with_name(f".{self.path.name}.new")
         try:
             with new.open("w", encoding="utf-8", newline="") as file:
                 writer = csv.writer(file, lineterminator="\n")
-                writer.writerow([*self.columns, *names])
-                writer.writerows([*row, *more(row)] for row in self.read())
+                writer.writerow(columns)
+                writer.writerows(rows)
                 file.flush()
                 os.fsync(file.fileno())
             new.replace(self.path)
@@ -171,16 +182,10 @@ class TailTable:
             new.unlink(missing_ok=True)
         self.part.unlink()
 
-    def _write(self, line: str) -> None:
-        try:
-            self._file.write(line)
-            self._file.flush()
-        except OSError as error:
-            raise self._failed(error) from None
-
     def _failed(self, error: OSError) -> CannotWriteTable:
         return CannotWriteTable(f"{self.part} cannot be written: {error.strerror or error}")
 
 
-def _format(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
+def format_cell(value: float | None, digits: int) -> str:
+    """Return a number with this many decimals; empty for None and NaN."""
+    return "" if value is None or math.isnan(value) else f"{value:.{digits}f}"
