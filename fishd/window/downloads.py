@@ -16,6 +16,7 @@ from urllib.parse import quote
 from aiohttp import web
 
 from fishd.core import text
+from fishd.core.errors import FishdError
 from fishd.core.files import FileProblem
 from fishd.window.children import JobError, call, spawn
 from fishd.window.fish_link import Busy
@@ -52,17 +53,23 @@ class Downloads:
         """Identifier of the device of each download at present."""
 
     async def send(
-        self, request: web.Request, run: str, file: str, device: str
+        self,
+        request: web.Request,
+        run: str,
+        file: str,
+        device: str,
+        check: Callable[[], object],
     ) -> web.StreamResponse:
         """Send a download to a device; raise `JobError`, and `Busy` for one too many.
 
         run: name of the file or folder of a run; file: one of `ENDINGS`
+        check: raises `FishdError` if the device may no longer get it
         """
         name = _file_name(run, file)
         with self._place_of(device):
             try:
                 async with self._open(run, file) as read:
-                    return await _send(request, read, name)
+                    return await _send(request, read, name, check)
             except FileProblem as problem:
                 raise JobError(str(problem)) from None
 
@@ -150,7 +157,9 @@ async def _packed(run: str, folder: Path) -> AsyncIterator[Read]:
         await process.wait()
 
 
-async def _send(request: web.Request, read: Read, name: str) -> web.StreamResponse:
+async def _send(
+    request: web.Request, read: Read, name: str, check: Callable[[], object]
+) -> web.StreamResponse:
     """Send a file of this name; raise `JobError` before it begins, `ConnectionError` later."""
     piece = await read()
     response = web.StreamResponse()
@@ -160,11 +169,12 @@ async def _send(request: web.Request, read: Read, name: str) -> web.StreamRespon
     await response.prepare(request)
     try:
         while piece:
+            check()
             async with asyncio.timeout(STALL_TIMEOUT_S):
                 await response.write(piece)
             piece = await read()
         await response.write_eof()
-    except (OSError, JobError) as error:  # also a timeout
+    except (OSError, FishdError) as error:  # also a timeout
         if request.transport:
             request.transport.abort()  # the browser must not take a part for the whole
         raise ConnectionAbortedError(f"{name} was not sent: {text.describe_error(error)}") from None

@@ -58,7 +58,12 @@ class RunRequests:
             message = f"no download '{text.quoted(file)}'; valid: {', '.join(ENDINGS)}"
             raise ApiError(404, "not-found", message)
         run = check_name(request.match_info["run"])
-        return await self._downloads.send(request, run, file, access.device_id)
+        device = access.device_id
+
+        def check() -> None:
+            self._access.require(request, "watch")
+
+        return await self._downloads.send(request, run, file, device, check)
 
     async def _change(self, request: web.Request, verb: str, *words: str) -> web.Response:
         """Let a verb of `fishctl runs` change a run."""

@@ -37,11 +37,12 @@ export function Rows({ result: { columns, labels, name: run } }) {
       ctx.stroke();
     };
     const range = (low, high) => [low - 0.05 * (high - low || 1), high + 0.05 * (high - low || 1)];
-    const ends = order.flatMap((row) => [-1, 1].map((sign) => scaled(columns[y], row) + sign * (scaled(half, row) ?? 0)));
+    const known = order.flatMap((row) => [-1, 1].map((sign) => scaled(columns[y], row) + sign * (scaled(half, row) ?? 0)));
+    const ends = known.length > 0 ? known : [0, 1];
     const plot = new globalThis.uPlot({
       width: node.current.clientWidth, height: HEIGHT, padding: [10, 12, 0, 0], legend: { show: false },
       cursor: { drag: { x: false, y: false } }, hooks: { drawSeries: [drawBars] },
-      scales: { x: { time: false, range: (_, low, high) => range(low, high) }, y: { range: () => range(Math.min(...ends), Math.max(...ends)) } },
+      scales: { x: { time: false, range: (_, low, high) => range(low ?? 0, high ?? 1) }, y: { range: () => range(Math.min(...ends), Math.max(...ends)) } },
       axes: [{ ...axis, size: 24 }, { ...axis, size: 52 }],
       series: [{}, ...groups.map((_, index) => ({
         stroke: colour(COLOURS[index % COLOURS.length]), paths: () => null, points: { show: true, size: 7, fill: colour(COLOURS[index % COLOURS.length]) },

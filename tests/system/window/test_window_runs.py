@@ -288,6 +288,22 @@ async def test_a_browser_that_stops_reading_loses_its_download(
                 await reader.readexactly(BIG_BYTES)
 
 
+async def test_a_device_that_is_revoked_loses_its_download(
+    window: WindowProcess, runs: Path
+) -> None:
+    write_big(runs / "big.mcap")
+    async with Browser(window.url, NETWORK_HOST) as browser:
+        token = window.invite("watch").rpartition("=")[2]
+        await browser.post("/api/pair", {"token": token, "name": "phone"})
+        async with browser.session.get(BIG) as response:
+            await response.content.readexactly(1)
+            window.ask("revoke", "phone")
+            while (await browser.get("/api/session"))["paired"]:
+                pass
+            with pytest.raises(aiohttp.ClientError):
+                await response.read()
+
+
 async def test_a_large_download_takes_little_memory(window: WindowProcess, runs: Path) -> None:
     write_big(runs / "big.mcap")
     write_big(runs / "swept" / "big.png")
