@@ -13,8 +13,11 @@ from playwright.sync_api import APIResponse, Page, Route, expect
 from rigs.browser import needs_browser, open_page, shared_browser
 from rigs.live_page import RESOLVED, go, live_page, name_device, swim
 from rigs.processes import Daemon, running, wait_until
+from rigs.recordings import record_run, swum
 from rigs.virtual_pi_process import Pi
 from rigs.window_process import WindowProcess
+
+from fishd.lab.experiment import Header, open_experiment
 
 pytestmark = needs_browser
 
@@ -484,6 +487,93 @@ def test_a_stored_run_is_opened_and_another_controller_is_run_on_it(
         expect(page.locator(".job.done")).to_have_count(2)
         expect(page.locator(".job").first).to_contain_text("sine in place of swing")
         assert complaints == []
+
+
+@pytest.fixture
+def kept_runs(new_window: WindowProcess) -> WindowProcess:
+    """Return a window whose folder has two recordings, and an experiment with rows."""
+    folder = new_window.state.parent / "runs"
+    folder.mkdir(exist_ok=True)
+    for number in (1, 2):
+        about = {"subject": f"fish {number}", "note": f"note {number}"}
+        record_run(swum(2.0), folder / f"run {number}", **about)
+    with open_experiment(folder / "swept", Header(kind="sweep", on="simulation")) as experiment:
+        table = experiment.open_table(["controller", "frequency", "thrust", "thrust_ci95"])
+        for number in range(6):
+            row = {"frequency": 1.0 + 0.2 * number, "thrust": 0.02, "thrust_ci95": 0.001}
+            table.add({"controller": ("square", "sine")[number % 2], **row})
+    return new_window
+
+
+def test_runs_are_found_compared_noted_renamed_and_deleted_with_undo(
+    kept_runs: WindowProcess,
+) -> None:
+    with live_page(kept_runs.url) as (page, complaints):
+        go(page, "runs")
+        runs = page.locator("#runs")
+        names = runs.locator("td.name")
+        expect(names).to_have_count(3)
+        page.get_by_label("Find").fill("FISH note 2")
+        expect(names).to_have_text(["run 2note 2"])
+        page.get_by_label("Find").fill("")
+        page.get_by_label("Began").select_option("last day")
+        expect(names).to_have_count(3)
+        page.get_by_label("Find").fill("2999-01-01")
+        expect(names).to_have_count(0)
+        page.get_by_label("Find").fill("")
+        page.locator(".filter").get_by_label("Controller").select_option("swing")
+        page.get_by_label("Sort by").select_option("fish")
+        expect(names).to_have_text(["run 1note 1", "run 2note 2"])
+        for number in (1, 2):
+            page.get_by_label(f"Compare run {number}").check()
+        page.get_by_role("button", name="Compare 2").click()
+        expect(page.locator(".comparison tbody tr")).to_have_count(2)
+        expect(page.locator(".comparison img")).to_be_visible()
+        page.get_by_role("button", name="Close comparison").click()
+
+        page.get_by_role("button", name="Open run 2").click()
+        page.get_by_label("Note", exact=True).fill("better")
+        page.get_by_role("button", name="Save").click()
+        expect(names.nth(1)).to_have_text("run 2better")
+        page.get_by_label("Name", exact=True).fill("run 1")
+        page.get_by_role("button", name="Rename").click()
+        expect(page.locator("#notices")).to_contain_text("exists already")
+        page.get_by_label("Name", exact=True).fill("third")
+        page.get_by_role("button", name="Rename").click()
+        expect(page.get_by_role("button", name="Close third")).to_be_visible()
+        with page.expect_download() as download:
+            page.get_by_role("link", name="CSV", exact=True).click()
+        assert download.value.suggested_filename == "third.csv"
+        page.get_by_role("button", name="Delete").click()
+        page.get_by_role("button", name="Trash").click()
+        expect(page.locator(".trash li")).to_contain_text("third")
+        page.get_by_role("button", name="Undo").click()
+        expect(names).to_have_text(["run 1note 1", "thirdbetter"])
+        expect(page.locator(".trash li")).to_have_count(0)
+        assert [line for line in complaints if "409" not in line] == []
+
+
+def test_an_opened_run_a_comparison_and_the_trash_fit_each_screen_and_have_no_barrier(
+    kept_runs: WindowProcess,
+) -> None:
+    with live_page(kept_runs.url, bypass_csp=True) as (page, _):
+        page.evaluate(AXE.read_text(encoding="utf-8"))
+        go(page, "runs")
+        for run in ("run 1", "run 2", "swept"):
+            page.get_by_label(f"Compare {run}").check()
+        page.get_by_role("button", name="Compare 3").click()
+        page.get_by_role("button", name="Open swept").click()
+        page.get_by_role("button", name="Trash").click()
+        expect(page.locator(".rows canvas")).to_be_visible()
+        expect(page.locator(".comparison tbody tr")).to_have_count(2)
+        expect(page.locator(".comparison img")).to_be_visible()
+        expect(page.locator(".note")).to_have_count(1)  # the sweep has no recording to draw
+        expect(page.locator(".trash .muted")).to_contain_text("empty")
+        for width in (1280, 800, 390):
+            page.set_viewport_size({"width": width, "height": 844})
+            assert page.evaluate("document.documentElement.scrollWidth") == width
+            refuse_barriers(page)
+        walk(page)
 
 
 def test_lost_ticks_are_drawn_as_a_gap_and_suspect_samples_are_marked(
