@@ -115,10 +115,12 @@ def test_a_disk_that_is_full_leaves_the_queue_as_it_was(
     assert order(file) == [1]
 
 
-def test_a_folder_that_cannot_be_created_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "runs").write_text("a file")
+def test_a_folder_that_cannot_be_created_is_one_line(file: QueueFile) -> None:
+    file.runs.write_text("a file")
     with pytest.raises(QueueError, match="cannot be written: File exists"):
-        add(QueueFile(tmp_path / "runs", ADDRESS), 60.0)
+        add(file, 60.0)
+    with pytest.raises(QueueError, match="lock cannot be written: File exists"), file.running():
+        pass
 
 
 def test_what_ran_when_its_runner_was_killed_is_said_and_nothing_runs_any_more(
