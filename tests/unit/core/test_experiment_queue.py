@@ -1,5 +1,6 @@
 """The file of a queue: what it keeps, what it refuses, and what it says of a killed runner."""
 
+import time
 from pathlib import Path
 
 import pytest
@@ -162,7 +163,7 @@ def test_the_experiment_that_runs_is_neither_removed_nor_cleared(file: QueueFile
 def test_the_time_that_is_left_counts_all_runs_and_what_has_passed(
     file: QueueFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(experiment_queue.time, "time", lambda: 1010.0)
+    monkeypatch.setattr(time, "time", lambda: 1010.0)
     add(file, 60.0, 20.0, repeat=3)
     add(file, None)
     view = file.view()
