@@ -21,7 +21,9 @@ from fishd.recording.folder import runs_folder
 
 EXPERIMENTS = ("measure", "sweep", "compare", "optimise", "identify", "adapt", "learn")
 """Verbs that a queue takes."""
-_CHOSEN_OPTIONS = ("--folder", "--resume", "--endpoint", "--json", "--take", "--dry-run")
+_CHOSEN_OPTIONS = {
+    "--folder", "--resume", "--endpoint", "--json", "--take", "--dry-run", "--help", "-h",
+}  # fmt: skip
 """Options of an experiment that the queue chooses."""
 
 

@@ -124,7 +124,7 @@ class QueueRunner:
         self._take, self._last_line = False, ""
         echo(f"fishctl: experiment {item.id}: {' '.join(item.words)}", err=True)
         try:
-            # In a session of its own, as Ctrl-C in this terminal is for the runner.
+            # Another session, as Ctrl-C in this terminal is for the runner.
             child = subprocess.Popen(
                 fishctl_command(words),
                 stdin=subprocess.DEVNULL,

@@ -8,7 +8,7 @@ import re
 import time
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -224,12 +224,16 @@ class QueueFile:
     @contextmanager
     def running(self) -> Iterator[None]:
         """Be the runner while this lasts; raise `QueueError` if there is one."""
-        try:
-            self.runs.mkdir(parents=True, exist_ok=True)
-            with locked(self._runner, timeout=RUNNER_TIMEOUT_S):
-                yield
-        except LockHeld as held:
-            raise QueueError(f"process {held.pid} runs this queue already") from None
+        with ExitStack() as stack:
+            try:
+                self.runs.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(locked(self._runner, timeout=RUNNER_TIMEOUT_S))
+            except LockHeld as held:
+                raise QueueError(f"process {held.pid} runs this queue already") from None
+            except OSError as error:
+                message = f"{self._runner}.lock cannot be written: {error.strerror}"
+                raise QueueError(message) from None
+            yield
 
     def find_runner(self) -> str | None:
         """Return the process that runs the queue; None if none does."""

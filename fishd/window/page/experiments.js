@@ -12,8 +12,8 @@ export async function startJob({ state, notice, changed, becomeDriver }, kind, o
   const drives = kind === "queue" || (kind === "resume" ? options.on !== "simulation" : isExperiment && options.on !== "simulation");
   try {
     if (drives && (take || !state.driver?.you_drive)) await becomeDriver(take);
-    const more = drives && take ? { take } : {};
-    const job = await call("POST", "/api/jobs", { fish: state.name, kind, options: { ...options, ...more } }, CHECK_TIMEOUT_MS);
+    const { on, ...others } = options, sent = kind === "resume" ? others : options, more = drives && take ? { take } : {};
+    const job = await call("POST", "/api/jobs", { fish: state.name, kind, options: { ...sent, ...more } }, CHECK_TIMEOUT_MS);
     state.jobs.set(job.id, job);
     changed();
   } catch (error) {
@@ -79,7 +79,7 @@ export function Experiments(page) {
     <ul class="jobs" aria-label="Started experiments">
       ${[...state.jobs.values()].filter(({ fish, kind }) => kind !== "queue" && (!fish || fish === state.name)).sort((a, b) => b.id - a.id).slice(0, 8)
         .map((job) => html`<${Job} key=${job.id} job=${job} state=${state} notice=${notice} mayDrive=${state.session?.scope === "drive"}
-        resume=${() => startJob(page, "resume", { run: job.run })} />`)}
+        resume=${() => startJob(page, "resume", { run: job.run, on: job.command.join(" ").includes("--on simulation") ? "simulation" : "live" })} />`)}
     </ul>`;
 }
 

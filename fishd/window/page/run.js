@@ -4,9 +4,6 @@ import { selectionWithOwn, startJob } from "./experiments.js";
 import { Picture, Results, useResults } from "./results.js";
 import { Rows } from "./rows.js";
 
-/** Kinds of experiments that the server resumes. */
-const RESUMABLE = ["measure", "sweep", "compare"];
-
 /** Return the name of the file or folder of a run, by which the server knows it. */
 export const idOf = (run) => run.path.split("/").at(-1);
 export const isInProgress = (run) => ["running", "recording"].includes(run.state);
@@ -20,7 +17,7 @@ export function Run({ run, page, changed, open }) {
   const [found, failure] = useResults([id]);
   const about = [run.about?.subject, run.about?.operator && `by ${run.about.operator}`, run.problem].filter(Boolean).join("; ");
   const rerun = (options) => () => startJob(page, "rerun", { run: id, ...options });
-  const resumable = run.state === "unfinished" && run.on === "live" && RESUMABLE.includes(run.kind);
+  const resumable = run.state === "unfinished" && state.forms?.some((form) => form.is_experiment && form.words.join(" ") === run.kind);
   const ask = (what, body) => call("POST", `${pathOf(id)}/${what}`, body).then((result) => {
     changed();
     return result;
@@ -53,7 +50,7 @@ export function Run({ run, page, changed, open }) {
         Rerun with ${controllerText(controller.name, own)}</button>`}
       <span class="muted">Runs a controller again on the recorded forces, and compares its commands. The fish rests.</span></div>`}
     ${resumable && html`<div class="buttons"><button type="button" class="primary" disabled=${!mayDrive}
-      onClick=${() => startJob(page, "resume", { run: id })}>Resume</button>
+      onClick=${() => startJob(page, "resume", { run: id, on: run.on })}>Resume</button>
       <span class="muted">It ended before it was complete; nothing is measured again.</span></div>`}
     ${failure && html`<p class="note">${sentence(failure)}</p>`}
     ${found && html`<${Results} results=${found} />`}

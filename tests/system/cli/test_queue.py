@@ -84,6 +84,7 @@ def terminal(daemon: Daemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         ("learn ppo --on live --seeds 2", "there is only one live fish"),
         ("record", "'record' is not an experiment"),
         ("measure swing --folder here", "--folder is chosen by the queue"),
+        ("-- measure swing --help", "--help is chosen by the queue"),
         ("measure swing --take", "--take is chosen by the queue"),
         ("--repeat 0 measure swing", "--repeat"),
         ("measure swing --repeat many", "--repeat"),

@@ -64,6 +64,25 @@ async def test_a_page_and_a_terminal_change_the_same_queue(
         assert (await browser.get(QUEUE))["items"] == []
 
 
+async def test_each_experiment_of_a_form_waits_in_the_queue(new_window: WindowProcess) -> None:
+    square = {"controller": "square"}
+    options: dict[str, Any] = {
+        "measure": square,
+        "sweep": {**square, "parameters": {"frequency": "1,1.5,2"}},
+        "compare": {"contestants": ["square", "swing:C=0.6"]},
+        "optimise": {**square, "parameters": {"frequency": "1:3"}},
+        "identify": {},
+        "adapt": {},
+        "learn": {"steps": 1000, "on": "simulation"},
+    }
+    async with Browser(new_window.url) as browser, open_page(browser) as page:
+        for kind, given in options.items():
+            view = await page.post("queue", {"op": "add", "kind": kind, "options": given})
+            assert view["items"][-1]["words"][0] == kind
+        assert [item["seconds"] for item in view["items"][:5]] == [60, 90, 120, 300, 180]
+        assert view["items"][-1]["words"][-2:] == ["--steps", "1000"]
+
+
 async def test_a_queue_that_a_page_starts_goes_on_without_it_and_is_stopped_by_another(
     new_window: WindowProcess, daemon: Daemon
 ) -> None:

@@ -1,5 +1,6 @@
 """The file of a queue: what it keeps, what it refuses, and what it says of a killed runner."""
 
+import time
 from pathlib import Path
 
 import pytest
@@ -115,10 +116,12 @@ def test_a_disk_that_is_full_leaves_the_queue_as_it_was(
     assert order(file) == [1]
 
 
-def test_a_folder_that_cannot_be_created_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "runs").write_text("a file")
+def test_a_folder_that_cannot_be_created_is_one_line(file: QueueFile) -> None:
+    file.runs.write_text("a file")
     with pytest.raises(QueueError, match="cannot be written: File exists"):
-        add(QueueFile(tmp_path / "runs", ADDRESS), 60.0)
+        add(file, 60.0)
+    with pytest.raises(QueueError, match="lock cannot be written: File exists"), file.running():
+        pass
 
 
 def test_what_ran_when_its_runner_was_killed_is_said_and_nothing_runs_any_more(
@@ -160,7 +163,7 @@ def test_the_experiment_that_runs_is_neither_removed_nor_cleared(file: QueueFile
 def test_the_time_that_is_left_counts_all_runs_and_what_has_passed(
     file: QueueFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(experiment_queue.time, "time", lambda: 1010.0)
+    monkeypatch.setattr(time, "time", lambda: 1010.0)
     add(file, 60.0, 20.0, repeat=3)
     add(file, None)
     view = file.view()
