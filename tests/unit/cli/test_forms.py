@@ -26,7 +26,7 @@ def forms() -> dict[str, Form]:
 
 
 def test_each_experiment_of_the_command_line_has_a_form() -> None:
-    assert {*VERBS["Experiment"], "learn"} - {"optimum", *forms()} == set()
+    assert {*VERBS["Experiment"], "learn"} - {"optimum", "queue", *forms()} == set()
 
 
 def test_a_form_offers_no_file_no_other_fish_and_no_number_of_processes() -> None:
