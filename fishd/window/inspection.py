@@ -177,20 +177,20 @@ async def _read_log(link: FishLink) -> Row:
     """Return the latest lines of fishd's journal, or why there are none."""
     if not _is_service(link):
         return {"lines": [], "problem": "fishd is not the service of this computer; see its events"}
-    shown = f"journalctl --unit={UNIT} --lines={LOG_LINES}"
+    command = f"journalctl --unit={UNIT} --lines={LOG_LINES}"
     options = ("--output=short-iso", "--no-hostname", "--no-pager", "--quiet")
+    lines = list[str]()
     try:
         journal = await asyncio.create_subprocess_exec(
-            *shown.split(), *options, stdin=DEVNULL, stdout=PIPE, stderr=PIPE
+            *command.split(), *options, stdin=DEVNULL, stdout=PIPE, stderr=PIPE
         )
+        output, errors = await journal.communicate()
+        lines = output[-MAX_LOG_BYTES:].decode("utf-8", "replace").splitlines()[-LOG_LINES:]
+        reason = text.line(errors.decode("utf-8", "replace"))
     except OSError as error:
-        return {"lines": [], "problem": f"journalctl: {text.describe_error(error)}"}
-    output, errors = await journal.communicate()
-    lines = output[-MAX_LOG_BYTES:].decode("utf-8", "replace").splitlines()[-LOG_LINES:]
-    reason = (
-        text.line(errors.decode("utf-8", "replace")) or "the journal has no line that it may read"
-    )
-    return {"lines": lines, "problem": "" if lines else f"{reason}; run: sudo {shown}"}
+        reason = f"journalctl: {text.describe_error(error)}"
+    problem = f"{reason or 'the journal has no line that the page may read'}; run: sudo {command}"
+    return {"lines": lines, "problem": "" if lines else problem}
 
 
 def _measure_rate(recordings: list[Any]) -> tuple[float, int]:
