@@ -39,6 +39,7 @@ VERBS = {
         "optimise": Verb("optimise", "optimise", "Find the best parameters of a controller."),
         "identify": Verb("identify", "identify", "Fit a fish to its forces, with intervals."),
         "adapt": Verb("adapt", "adapt", "Find a new fish's best gait: fit, train, measure."),
+        "queue": Verb("queue", "queue", "Run experiments one after another, overnight too."),
         "optimum": Verb("optimum", "optimum", "Show the command with the largest thrust."),
     },
     "Record": {

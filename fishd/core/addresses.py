@@ -190,6 +190,11 @@ def find_control_address() -> str:
     return f"ipc://{own}"
 
 
+def is_default_address(address: str) -> bool:
+    """Return whether clients find a fishd at this address without being given one."""
+    return address in (f"ipc://{SERVICE_SOCKET}", f"ipc://{_private_socket('control')}")
+
+
 def _may_exist(path: Path) -> bool:
     """Return whether a path exists, as far as this user can see."""
     try:

@@ -6,7 +6,7 @@ the same header. Files are written atomically, and each row immediately.
 
 import math
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from operator import itemgetter
@@ -19,6 +19,7 @@ from msgspec import Struct
 from fishd import __version__
 from fishd.core import files, text
 from fishd.core.errors import ConfigError, FishdError
+from fishd.core.experiments import CurvePoint, Estimate
 from fishd.core.files import FileProblem, write_atomically
 from fishd.core.process.lockfile import LockHeld, NotALock, find_lock_holder, locked
 from fishd.lab import tables
@@ -42,11 +43,14 @@ T = TypeVar("T", bound=Struct)
 class Progress(Protocol):
     """Display of an experiment's progress, implemented by `fishd.cli.progress.Lines`."""
 
-    def done(self, line: str, amount: float) -> None:
+    def done(self, line: str, amount: float, point: CurvePoint | None = None) -> None:
         """Show a finished step; amount: amount of the total that is finished by now."""
 
     def at(self, amount: float, result: str | None = None) -> None:
         """Show the amount of the total that is finished by now, and a new preliminary result."""
+
+    def estimate(self, estimates: Sequence[Estimate], point: CurvePoint | None = None) -> None:
+        """Show the best values until now, and a new point of their curve."""
 
     def warn(self, line: str) -> None:
         """Show a warning on standard error."""
@@ -303,33 +307,46 @@ def count_rows(path: Path) -> int | None:
         return None
 
 
+SEARCHES = ("optimise", "identify", "adapt", "learn ppo")
+"""Kinds of experiments whose rows are candidates: the best of them is the luckiest one."""
+
+
 class Answer(NamedTuple):
     """Result of an experiment or, before its end, of its rows, for one line of a list."""
 
     thrust: float | None = None
-    """Largest thrust of its result or, before its end, of its table [N]."""
+    """Thrust of its result, or largest thrust of its table before its end [N].
+
+    A search has none before its end. Of a comparison, it is that of the chosen contestant.
+    """
     thrust_ci95: float | None = None
     """Half-width of the 95 % confidence interval of `thrust`, statistical [N]."""
     total_ci95: float | None = None
     """The same with the calibration [N]; None where that is not known."""
     summary: str = ""
     """Result other than a thrust, in words."""
+    seconds: float | None = None
+    """Tank time; None where the result does not have it [s]."""
     problem: str = ""
     """Reason why the result cannot be read; empty if it can, or if there is none."""
 
 
-def find_answer(path: Path) -> Answer:
-    """Return the result of an experiment."""
+def find_answer(path: Path, kind: str = "") -> Answer:
+    """Return the result of an experiment; kind: its verb."""
     try:
-        results = _read_results(path)
+        results = read_result(path)
+        if not results and kind not in SEARCHES:
+            results = read_rows(path)
     except FileProblem as problem:
-        return Answer(problem=f"{path / RESULT}: {problem}; delete it, the rows are kept")
+        return Answer(problem=str(problem))
+    results = [r for r in results if r.get("verdict") in ("wins", "chosen")] or results
     answers = [
         Answer(
-            _read_number(result.get("thrust")),
-            _read_number(result.get("thrust_ci95")),
-            _read_number(result.get("total_ci95")),
-            text.line(str(result.get("summary", ""))),
+            read_number(result.get("thrust")),
+            read_number(result.get("thrust_ci95")),
+            read_number(result.get("total_ci95")),
+            text.line(str(result.get("summary", "") or _describe_parameters(result))),
+            read_number(result.get("tank_time", result.get("seconds"))),
         )
         for result in results
     ]
@@ -340,16 +357,23 @@ def find_answer(path: Path) -> Answer:
     )
 
 
-def _read_results(path: Path) -> Iterable[Mapping[str, Any]]:
-    """Return the rows of the result or, before its end, of the table; raise `FileProblem`."""
-    if (path / RESULT).exists():
+def read_result(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of the result of an experiment; none before its end; raise `FileProblem`."""
+    if not (path / RESULT).exists():
+        return []
+    try:
         content = files.read(path / RESULT, MAX_TABLE_BYTES, "a result")
-        try:
-            results = msgspec.json.decode(content, type=list[dict[str, Any]] | dict[str, Any])
-        except msgspec.DecodeError as error:
-            raise FileProblem(f"not a result: {text.line(str(error))}") from None
-        if results:  # otherwise it was interrupted
-            return results if isinstance(results, list) else [results]
+        results = msgspec.json.decode(content, type=list[dict[str, Any]] | dict[str, Any])
+    except (FileProblem, msgspec.DecodeError) as error:
+        problem = error if isinstance(error, FileProblem) else f"not a result: {error}"
+        raise FileProblem(
+            f"{path / RESULT}: {text.line(str(problem))}; delete it, the rows are kept"
+        ) from None
+    return results if isinstance(results, list) else [results]
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Return the rows of the table of an experiment; none where it has no table."""
     try:
         head, *rows = tables.read(path / ROWS, MAX_TABLE_BYTES) or [[]]
         return [dict(zip(head, row, strict=False)) for row in rows]
@@ -357,7 +381,21 @@ def _read_results(path: Path) -> Iterable[Mapping[str, Any]]:
         return []
 
 
-def _read_number(value: Any) -> float | None:
+def _describe_parameters(result: Mapping[str, Any]) -> str:
+    """Return the best parameters of a search with their intervals; empty for anything else."""
+    lows, highs = result.get("parameters_ci95_low"), result.get("parameters_ci95_high")
+    if not (isinstance(lows, dict) and isinstance(highs, dict)):
+        return ""
+    known = {name: tuple(map(read_number, (low, highs.get(name)))) for name, low in lows.items()}
+    values = [
+        f"{name}={value:.4g} [{low:.4g}, {high:.4g}]"
+        for name, (low, high) in known.items()
+        if None not in (value := read_number(result["parameters"].get(name)), low, high)
+    ]
+    return f"best: {', '.join(values)}" if values else ""
+
+
+def read_number(value: Any) -> float | None:
     """Return a finite number of a table or of JSON; None for anything else."""
     try:
         number = float(value)

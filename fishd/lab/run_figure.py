@@ -5,7 +5,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, open_figure, plain
+from fishd.lab.drawing import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    YELLOW,
+    open_figure,
+    plain,
+)
 from fishd.lab.run_traces import (
     MIN_ANGLE_SPAN,
     MIN_FORCE_SPAN,
@@ -18,8 +28,11 @@ from fishd.lab.run_traces import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from numpy.typing import NDArray
 
     from fishd.lab.run_traces import Array
 
@@ -61,6 +74,55 @@ def draw_run(traces: Traces, path: str | os.PathLike[str]) -> None:
                 _loop(loop[0], traces.phi_c, traces.fin.at_ticks, traces.portrait)
             _spectrum(amplitude, density, traces, traces.portrait)
             _mean_beat(beat, traces, traces.portrait)
+
+
+def draw_runs(
+    runs: "Mapping[str, Traces]", left_out: "Sequence[str]", path: str | os.PathLike[str]
+) -> None:
+    """Write a figure with several runs over each other: thrust, beat, and mean beat of each.
+
+    runs: traces by the name of their run; time begins with the swim
+    left_out: names of runs that have no recording
+
+    Raises `FishdError` where writing fails, and `MissingPackage`.
+    """
+    colours = (BLUE, ORANGE, GREEN, PURPLE, YELLOW, BLACK)
+    units = sorted({traces.unit for traces in runs.values()})
+    with open_figure(path, (10.0, 6.4)) as figure:
+        thrust, beat, force = figure.subplots(3, 1)
+        for index, (name, traces) in enumerate(runs.items()):
+            style = {"color": colours[index % len(colours)]}
+            style |= {"linestyle": "-" if index < len(colours) else "--"}
+            running = np.isfinite(traces.thrust) & (np.nan_to_num(traces.frequency) > 0.0)
+            start = traces.time[np.argmax(running)] if running.any() else traces.time[0]
+            time, mean = traces.time - start, np.where(running, traces.thrust, np.nan)
+            thrust.plot(time, mean, label=plain(name), **style)
+            low, high = mean - traces.thrust_ci95, mean + traces.thrust_ci95
+            thrust.fill_between(time, low, high, color=style["color"], alpha=0.15, linewidth=0)
+            beat.plot(time, np.where(running, traces.frequency, np.nan), linewidth=0.9, **style)
+            if (swim := _latest_swim(running)) and (cycle := mean_beat(traces, swim)):
+                force.plot(cycle.phase, cycle.fx, linewidth=0.9, **style)
+        for axis in (thrust, force):
+            axis.axhline(0.0, color="0.85", linewidth=0.6)
+        thrust.set_ylabel(f"thrust ({plain(', '.join(units))})")
+        missing = f"; no recording: {plain(', '.join(left_out))}" if left_out else ""
+        thrust.set_title(f"thrust over whole beats, and its 95 % interval{missing}")
+        beat.set_ylabel("tail beat (Hz)")
+        beat.set_xlabel("time since the first beat (s)")
+        force.set_ylabel(f"mean $F_x$ ({plain(', '.join(units))})")
+        force.set_xlabel("phase of the beat, mean of the second half of the latest swim")
+        force.set_xlim(0.0, 1.0)
+        figure.legend(loc="outside upper left", ncols=4)
+
+
+def _latest_swim(running: "NDArray[np.bool_]") -> slice | None:
+    """Return the second half of the latest samples that are true without a break."""
+    swum = np.flatnonzero(running)
+    if not len(swum):
+        return None
+    breaks = np.flatnonzero(~running[: swum[-1]])
+    first = int(breaks[-1]) + 1 if len(breaks) else 0
+    return slice((first + int(swum[-1])) // 2, int(swum[-1]) + 1)
 
 
 def _forces(axis: "Axes", traces: Traces) -> None:

@@ -41,6 +41,7 @@ from fishd.recording.images import (
     decode_head,
 )
 from fishd.recording.mcap_file import Appended, Damaged, read_records
+from fishd.recording.notes import read_note
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX
 from fishd.recording.provenance import FORMAT
 from fishd.recording.summary import Gap, Summary, Tally, from_metadata
@@ -481,7 +482,7 @@ class Run:
 
     def _take_metadata(self, name: str, data: dict[str, str]) -> None:
         if name == "fishd.run":
-            self.about = data
+            self.about = data | read_note(self.path)
             if (layout := data.get("format", str(FORMAT))) != str(FORMAT):
                 raise RecordingError(
                     f"{self.path}: its layout is {text.quoted(layout)}, and this fishd reads "

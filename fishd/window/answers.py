@@ -12,6 +12,7 @@ from msgspec import Struct
 from fishd.core import text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError, FishError, NoDaemon, ParameterError, Refused
+from fishd.core.experiment_queue import QueueError
 from fishd.window import web_server
 from fishd.window.children import JobError
 from fishd.window.devices import DeviceError, DevicesBusy
@@ -112,7 +113,7 @@ def _refusal(error: FishdError) -> ApiError:
         return ApiError(503, "no-daemon", message)
     if isinstance(error, Busy | DevicesBusy):
         return ApiError(503, "busy", message)
-    if isinstance(error, JobError):
+    if isinstance(error, JobError | QueueError):
         return ApiError(409, "job", message)
     if isinstance(error, DeviceError):
         return ApiError(403, "device", message)

@@ -23,6 +23,7 @@ from fishd.core.protocol import Calibrations, PolicyInfo
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
 from fishd.window.estop_path import EstopPath
 from fishd.window.live import encode_message
+from fishd.window.past import Past
 
 log = logging.getLogger(__name__)
 
@@ -82,6 +83,7 @@ class FishLink:
         self.events: deque[bytes] = deque(maxlen=MAX_EVENTS)
         self._ticks: deque[tuple[int, bytes]] = deque(maxlen=MAX_TICKS)
         """Number and payload of each tick of the history."""
+        self._past = Past()
         self._history: tuple[float, int, list[bytes]] = (-HISTORY_AGE_S, 0, [])
         """When the history was encoded [s, monotonic], its last tick, and its messages."""
         self.listeners: set[Callable[[str, float, bytes], None]] = set()
@@ -212,6 +214,7 @@ class FishLink:
             self._forget()
         self._seq = tick.seq
         self._ticks.append((tick.seq, payload))
+        self._past.add(tick)
         if self._state in ("stale", "lost"):
             self._set_connection("live", "")
         self._batch.append(payload)
@@ -262,6 +265,7 @@ class FishLink:
     def _forget(self) -> None:
         """Forget the ticks of an earlier fishd."""
         self._ticks.clear()
+        self._past.clear()
         self._history = (-HISTORY_AGE_S, 0, [])
         self._batch.clear()
         self._seq = 0
@@ -282,12 +286,15 @@ class FishLink:
     def history(self) -> tuple[list[bytes], bytes]:
         """Return the history as messages for pages, shared by all within a second, and later ticks.
 
+        First come the extremes of ten minutes, then the latest ticks.
+
         Many requests must not take the processor from an emergency stop.
         """
         encoded, last, messages = self._history
         if time.monotonic() - encoded > HISTORY_AGE_S:
             payloads, last = [payload for _, payload in self._ticks], self._seq
-            messages = [
+            messages = self._past.messages()
+            messages += [
                 encode_message("history", _RAW(_columns(payloads[first : first + PART_TICKS])))
                 for first in range(0, len(payloads), PART_TICKS)
             ]

@@ -17,7 +17,7 @@ def open_run_picture(runs: Path, run: str) -> BinaryIO:
 
     Raise `NoFile` if there is no such folder, or no picture in it.
     """
-    place = _open(runs / run, f"'{run}'", os.O_DIRECTORY)
+    place = open_entry(runs / run, f"'{run}'", os.O_DIRECTORY)
     try:
         with os.scandir(place) as entries:
             name = min((entry.name for entry in entries if entry.name.endswith(".png")), default="")
@@ -33,14 +33,14 @@ def open_picture(path: Path, name: str, folder: int | None = None) -> BinaryIO:
 
     name: for messages; folder: descriptor of the folder to which a relative path belongs
     """
-    file = os.fdopen(_open(path, name, folder=folder), "rb")
+    file = os.fdopen(open_entry(path, name, folder=folder), "rb")
     if os.fstat(file.fileno()).st_size <= MAX_PICTURE_BYTES:
         return file
     file.close()
     raise FileProblem(f"{name} is longer than {MAX_PICTURE_BYTES // 2**20} MB")
 
 
-def _open(path: Path, name: str, kind: int = 0, folder: int | None = None) -> int:
+def open_entry(path: Path, name: str, kind: int = 0, folder: int | None = None) -> int:
     """Return a descriptor of a folder or a regular file; raise `FileProblem`."""
     is_wanted, wanted = (stat.S_ISDIR, "folder") if kind else (stat.S_ISREG, "regular file")
     try:

@@ -4,7 +4,7 @@ import asyncio
 import glob
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -20,7 +20,7 @@ from fishd.window.pictures import open_picture, open_run_picture
 RUNS_AGE_S = 1.0
 """Longest age of a list of runs [s]."""
 MAX_HEADER_BYTES = 2**20
-_RUN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,199}", re.A)
+_RUN_NAME = re.compile(r"(?![-.~])[^/\x00-\x1f\x7f]{1,200}")
 
 
 class Header(Struct):
@@ -40,9 +40,10 @@ class Runs:
 
     def __init__(self, folder: Path, scratch: Path) -> None:
         """scratch: folder for pictures that are drawn on request"""
-        self.folder, self._scratch = folder, scratch
+        self.folder, self.scratch = folder, scratch
         self._list: tuple[float, Any] = (-RUNS_AGE_S, [])
         self._listing, self._plotting = asyncio.Lock(), asyncio.Lock()
+        self._calling = asyncio.Lock()
         self._drawn: dict[str, list[tuple[str, int, int]]] = {}
         """Stamp of each run when its picture was drawn."""
 
@@ -79,20 +80,41 @@ class Runs:
 
     async def plot(self, name: str) -> BinaryIO:
         """Return the picture of a run, open; draw it if it has none; raise `JobError`."""
-        if not _RUN_NAME.fullmatch(name):
-            raise JobError(f"'{text.quoted(name)}' is not the name of a run")
+        check_name(name)
         try:
             with suppress(files.NoFile):
-                return await asyncio.to_thread(open_run_picture, self.folder, name)
+                if not name.endswith((".mcap", ".part")):
+                    return await asyncio.to_thread(open_run_picture, self.folder, name)
             return await self._draw(name)
         except files.FileProblem as problem:
             raise JobError(str(problem)) from None
+
+    async def call_json(self, verb: str, *names: str) -> Any:
+        """Return what a verb of `fishctl runs` prints as JSON, one at a time; raise `JobError`."""
+        words = ["runs", verb, f"--folder={self.folder}", "--json", "--", *names]
+        async with self._calling:
+            return msgspec.json.decode(await call(words, self.folder) or b"null")
+
+    async def change(self, verb: str, *words: str) -> Any:
+        """Return what a verb of `fishctl runs` prints that changes runs; raise `JobError`."""
+        try:
+            return await self.call_json(verb, *words)
+        finally:
+            self.forget()
+
+    async def plot_over_each_other(self, names: Sequence[str]) -> BinaryIO:
+        """Return a picture of several runs over each other, open; raise `JobError`."""
+        picture = self.scratch / "compared.png"
+        paths = [str(self.folder / name) for name in names]
+        async with self._plotting:
+            await call(["plot", "--force", f"--to={picture}", "--json", *paths], self.folder)
+            return await asyncio.to_thread(picture.open, "rb")
 
     async def _draw(self, name: str) -> BinaryIO:
         """Return a picture of a run that is drawn here, again if it has changed."""
         try:
             async with self._plotting:
-                picture = self._scratch / f"{name}.png"
+                picture = self.scratch / f"{name}.png"
                 stamp = await asyncio.to_thread(_read_stamp, self.folder, name)
                 if not stamp or stamp != self._drawn.get(name):
                     where = (f"--folder={self.folder}", f"--to={picture}")
@@ -101,6 +123,13 @@ class Runs:
                 return await asyncio.to_thread(open_picture, picture, f"the picture of {name}")
         except files.NoFile:
             raise JobError(f"{name} could not be drawn") from None
+
+
+def check_name(name: str) -> str:
+    """Return a name that a run in the folder may have; raise `JobError` for any other one."""
+    if not _RUN_NAME.fullmatch(name):
+        raise JobError(f"'{text.quoted(name)}' is not the name of a run")
+    return name
 
 
 def _is_empty(folder: Path) -> bool:
@@ -114,7 +143,8 @@ def _is_empty(folder: Path) -> bool:
 
 def _read_stamp(folder: Path, name: str) -> list[tuple[str, int, int]]:
     """Return what changes with the files of a run: name, size and time of each."""
-    paths = [*folder.glob(f"{glob.escape(name)}.mcap*"), *(folder / name).glob("*")]
+    stem = name.removesuffix(".part").removesuffix(".mcap")
+    paths = [*folder.glob(f"{glob.escape(stem)}.*"), *(folder / name).glob("*")]
     with suppress(OSError):
         stats = [(path.name, path.stat()) for path in sorted(paths)]
         return [(name, status.st_size, status.st_mtime_ns) for name, status in stats]

@@ -23,6 +23,7 @@ from fishd.window.live import encode
 from fishd.window.metrics import MetricsRequests
 from fishd.window.pages import Pages
 from fishd.window.paired_devices import PairedDevices
+from fishd.window.queue_requests import QueueRequests
 from fishd.window.register import Register, take_lost_jobs
 from fishd.window.settings import WindowSettings
 from fishd.window.web_server import WebServer, file_routes
@@ -58,6 +59,7 @@ class WindowServer(WebServer):
             name: CameraFeed(address, self._pages.links[name])
             for name, address in settings.camera_addresses.items()
         }
+        job_requests = JobRequests(access, self._pages, self._jobs)
         host, port = settings.address
         routes = [
             *file_routes(resources.files(__package__).joinpath("page"), "index.html"),
@@ -66,7 +68,8 @@ class WindowServer(WebServer):
             web.get("/camera", self._serve_camera),
             *access.routes,
             *FishRequests(access, self._pages).routes,
-            *JobRequests(access, self._pages, self._jobs).routes,
+            *job_requests.routes,
+            *QueueRequests(access, self._pages, job_requests).routes,
             *InspectionRequests(
                 access, self._pages, self._jobs.runs, settings.camera_addresses
             ).routes,

@@ -58,6 +58,32 @@ def backlash(half_width: float, amplitude: float = 0.3, frequency: float = 0.5) 
     return lambda time: np.interp(time, times, angles)
 
 
+class Thing(NamedTuple):
+    """Ellipse on the surface, such as a hand, another fish or a leaf; lengths are fractions."""
+
+    start: tuple[float, float]
+    """Place at time 0: from the left edge, and below the middle row."""
+    velocity: tuple[float, float]
+    """Widths of the picture per second."""
+    half_axes: tuple[float, float]
+    direction: float = 0.5
+    """Direction of the first axis against the rows [rad]."""
+    level: float | None = None
+    """Grey level; None: that of the tail."""
+
+
+class Knock(NamedTuple):
+    """Change of the camera's pose."""
+
+    time: float
+    """Time from which the picture is changed [s]."""
+    turn: float = 0.0
+    """Turn about the centre of the picture [rad]."""
+    zoom: float = 1.0
+    shift: tuple[float, float] = (0.0, 0.0)
+    """Fractions of the picture's width."""
+
+
 @dataclass(frozen=True)
 class Film:
     """Settings of a film; lengths are fractions of the picture's width unless said otherwise."""
@@ -90,6 +116,9 @@ class Film:
     lens: float = 0.0
     """Relative displacement at the corners."""
     tilt: float = 0.0
+    """Angle of the camera against the plane of the tail, towards the tip [rad]."""
+    aspect: float = 1.0
+    """Height of a pixel relative to its width."""
     bend: float = 0.0
     """Change of direction along the fin at its highest speed [rad]."""
     top_rate: float = 5.3
@@ -99,10 +128,13 @@ class Film:
     glare: tuple[float, float, float] | None = None
     """Column and row of a mirrored lamp, and its radius, as fractions of the width."""
     bubbles: int = 0
-    intruder: float = 0.0
-    """Radius of something dark that crosses the picture, as a fraction of the width."""
-    knock: tuple[float, float] = (math.inf, 0.0)
-    """Time [s] at which the picture turns about its centre, and angle [rad]."""
+    things: tuple[Thing, ...] = ()
+    knock: Knock = field(default_factory=lambda: Knock(math.inf))
+    torn: float = 0.0
+    """Fraction of the tail's length that is missing at the tip."""
+    brightness: float = 1.0
+    repeated: tuple[float, float] = (math.inf, math.inf)
+    """Times [s] between which the camera repeats one picture."""
 
 
 class Shot(NamedTuple):
@@ -137,16 +169,20 @@ class FilmedTail:
         return np.asarray(self.film.motion(np.asarray(time, np.float64)))
 
     def shots(self, begin: float, end: float) -> Iterator[Shot]:
+        shot = None
         for number in range(math.ceil(begin * self.film.rate), math.floor(end * self.film.rate)):
             if self._random.uniform() >= self.film.lost:
                 time = number / self.film.rate
-                yield Shot(time, self.picture(time))
+                first, last = self.film.repeated
+                if shot is None or not first <= time < last:
+                    shot = Shot(time, self.picture(time))
+                yield shot._replace(time=time)
 
     def picture(self, time: float) -> NDArray[np.uint8]:
         film = self.film
         w, h = film.width, film.height
         picture = self._floor
-        if film.waves or time >= film.knock[0]:
+        if film.waves or time >= film.knock.time:
             picture = self._moved_floor(time)
         cover = self._cover(time)
         if cover is not None:
@@ -164,6 +200,8 @@ class FilmedTail:
             picture *= (1.0 + film.flicker * np.sin(math.tau * 100.0 * rows + 1.0)).astype(
                 np.float32
             )[:, None]
+        if film.brightness != 1.0:
+            picture *= np.float32(film.brightness)
         if film.noise:
             y, x = self._random.integers(256, size=2)
             picture += self._noise[y : y + h, x : x + w]
@@ -195,8 +233,9 @@ class FilmedTail:
         half = np.interp(along, [0.0, FIN_FROM, 1.0], film.half_thickness) / film.length
         upper, lower = points + half[:, None] * normal, points - half[:, None] * normal
         index = np.arange(_STATIONS)
+        place = np.minimum(index, round((1.0 - film.torn) * (_STATIONS - 1)))
         outline = np.concatenate(
-            [upper[index, index], lower[2 * _STATIONS - 1 - index, index][::-1]]
+            [upper[index, place], lower[2 * _STATIONS - 1 - index, place][::-1]]
         )
         turn = np.array(
             [[math.cos(film.yaw), -math.sin(film.yaw)], [math.sin(film.yaw), math.cos(film.yaw)]]
@@ -210,15 +249,17 @@ class FilmedTail:
         """Return where points of an ideal camera are seen [px]."""
         film = self.film
         offset = points - self._centre
-        if time >= film.knock[0]:
-            c, s = math.cos(film.knock[1]), math.sin(film.knock[1])
-            offset = offset @ np.array([[c, s], [-s, c]])
+        knock = film.knock
+        if time >= knock.time:
+            c, s = knock.zoom * math.cos(knock.turn), knock.zoom * math.sin(knock.turn)
+            offset = offset @ np.array([[c, s], [-s, c]]) + film.width * np.array(knock.shift)
         if film.tilt:
-            offset = offset / (1.0 + math.tan(film.tilt) * offset[:, :1] / film.width)
+            depth = 1.0 + math.sin(film.tilt) * offset[:, :1] / film.width
+            offset = offset * (math.cos(film.tilt), 1.0) / depth
         if film.lens:
             radius = np.linalg.norm(offset, axis=1, keepdims=True) / math.hypot(*self._centre)
             offset = offset * (1.0 + film.lens * radius**2)
-        seen = self._centre + offset
+        seen = self._centre + offset / (1.0, film.aspect)
         if film.waves:
             seen = seen + self._displacement(seen, time)
         return np.asarray(seen)
@@ -276,7 +317,7 @@ class FilmedTail:
                 back + 1.1 * half * across,
             ]
         )
-        if film.lens or film.tilt:
+        if film.lens or film.tilt or film.aspect != 1.0:
             corners = (self._project(corners / SAMPLES - 0.5, -1.0) + 0.5) * SAMPLES
         cv2.fillPoly(mask, [np.rint(corners).astype(np.int32)], 255)
         covered = cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
@@ -287,9 +328,11 @@ class FilmedTail:
         seen = self._grid
         if film.waves:
             seen = seen - self._displacement(seen, time)
-        if time >= film.knock[0]:
-            c, s = math.cos(-film.knock[1]), math.sin(-film.knock[1])
-            seen = self._centre + (seen - self._centre) @ np.array([[c, s], [-s, c]])
+        knock = film.knock
+        if time >= knock.time:
+            c, s = math.cos(knock.turn) / knock.zoom, math.sin(knock.turn) / knock.zoom
+            offset = seen - self._centre - film.width * np.array(knock.shift)
+            seen = self._centre + offset @ np.array([[c, -s], [s, c]])
         size = (self._grid_shape[1] * 8, self._grid_shape[0] * 8)
         maps = []
         for axis in (0, 1):
@@ -332,7 +375,7 @@ class FilmedTail:
         return np.asarray(cv2.resize(pattern, (w, h), interpolation=cv2.INTER_LINEAR))
 
     def _disturb(self, picture: NDArray[np.float32], time: float) -> None:
-        """Draw bubbles and the intruder."""
+        """Draw bubbles and things."""
         film = self.film
         w, h = film.width, film.height
         for x, y, speed, size in self._bubbles:
@@ -341,12 +384,12 @@ class FilmedTail:
                 round(16 * h * ((y + 0.3 * time) % 1.0)),
             )
             cv2.circle(picture, centre, round(16 * w * (0.004 + 0.006 * size)), 235.0, -1, shift=4)
-        if film.intruder:
-            x = (0.15 * time) % 1.4 - 0.2
-            y = 0.5 * h / w + 0.3 * math.sin(time)
+        for thing in film.things:
+            x, y = (a + b * time for a, b in zip(thing.start, thing.velocity, strict=True))
             cv2.ellipse(
                 picture,
-                (round(16 * w * x), round(16 * w * y)),
-                (round(16 * w * film.intruder * 2), round(16 * w * film.intruder)),
-                30.0, 0, 360, film.tail, -1, shift=4,
+                (round(16 * w * x), round(16 * (0.5 * h + w * y))),
+                (round(16 * w * thing.half_axes[0]), round(16 * w * thing.half_axes[1])),
+                math.degrees(thing.direction), 0, 360,
+                film.tail if thing.level is None else thing.level, -1, shift=4,
             )  # fmt: skip

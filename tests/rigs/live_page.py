@@ -8,6 +8,10 @@ from playwright.sync_api import Page, expect
 
 from rigs.browser import open_page
 from rigs.processes import PATIENCE
+from rigs.window_process import NETWORK_HOST
+
+RESOLVED = f"--host-resolver-rules=MAP {NETWORK_HOST} 127.0.0.1"
+"""Option of the browser, with which it opens the link of an invitation."""
 
 expect.set_options(timeout=PATIENCE * 1e3)
 
@@ -18,6 +22,12 @@ def live_page(url: str, **settings: Any) -> Iterator[tuple[Page, list[str]]]:
     with open_page(f"{url}/", **settings) as (page, complaints):
         expect(page.locator("#connection")).to_contain_text("live")
         yield page, complaints
+
+
+def name_device(page: Page, name: str) -> None:
+    """Give the name for which a page that was opened by a link asks."""
+    page.get_by_label("Name of this device").fill(name)
+    page.get_by_role("button", name="Pair").click()
 
 
 def go(page: Page, place: str) -> None:

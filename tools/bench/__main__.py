@@ -7,7 +7,7 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # tools/
 
 from common.report import run  # noqa: E402
 
-NAMES = ("tick", "accuracy", "camera", "fin_angle", "swimmer")
+NAMES = ("tick", "accuracy", "camera", "fin_angle", "swimmer", "window")
 
 if __name__ == "__main__":
     sys.exit(run("bench", NAMES))

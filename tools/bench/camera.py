@@ -14,12 +14,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-import numpy as np
-
 from common.daemon import TIMEOUT_S, Fishd, read_size
 from common.machine import priorities, scheduling
 from common.processes import BIN, FISHCTL, Process, call, sets
-from common.report import Options, Report, progress, quantile, table
+from common.report import Options, Report, progress, quantile_of_rounds, quantile_ratio, table
 from fishd.camera.messages import CameraState
 from fishd.camera.requests import CameraLost, CameraRequests
 
@@ -132,23 +130,11 @@ def _take_turn(fishd: Fishd, which: str, seconds: float, *settings: str) -> Turn
 
 def _row(which: str, turns: dict[str, list[Turn]]) -> list[str]:
     late, without = ([turn.lateness for turn in turns[name]] for name in (which, NONE))
-    ratio = ""
-    if which != NONE:
-        draw = np.random.default_rng(0).integers(len(late), size=(1000, len(late)))
-        drawn = [
-            _quantile([late[n] for n in chosen]) / _quantile([without[n] for n in chosen])
-            for chosen in draw
-        ]
-        low, high = np.percentile(drawn, (2.5, 97.5))
-        ratio = f"{_quantile(late) / _quantile(without):.2f} ({low:.2f} to {high:.2f})"
+    low, high = (quantile_of_rounds(late, share) for share in (0.5, 0.99))
     return [
         which,
-        f"{_quantile(late, 0.5):.0f}/{_quantile(late):.0f}",
-        ratio,
+        f"{low:.0f}/{high:.0f}",
+        "" if which == NONE else quantile_ratio(late, without),
         f"{statistics.mean(turn.measured for turn in turns[which]):.1f}",
         f"{max(turn.memory for turn in turns[which]):.0f}",
     ]
-
-
-def _quantile(rounds: list[list[float]], share: float = 0.99) -> float:
-    return quantile([value for late in rounds for value in late], share)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 Options = dict[str, dict[str, Any]]
@@ -158,6 +159,31 @@ def _parted(document: Path, name: str) -> tuple[str, str, str]:
 def quantile(values: Sequence[float], share: float) -> float:
     """Return the value that a fraction `share` of all values does not exceed."""
     return sorted(values)[min(len(values) - 1, int(share * len(values)))]
+
+
+def quantile_of_rounds(rounds: Iterable[Sequence[float]], share: float) -> float:
+    """Return that quantile of all values of several rounds."""
+    return quantile([value for values in rounds for value in values], share)
+
+
+def quantile_ratio(
+    rounds: Sequence[Sequence[float]], reference: Sequence[Sequence[float]], share: float = 0.99
+) -> str:
+    """Return the ratio of two quantiles and its 95 % interval, a bootstrap over rounds.
+
+    Round n of both is from the same time.
+    """
+    chosen = [
+        range(len(rounds)),
+        *np.random.default_rng(0).integers(len(rounds), size=(1000, len(rounds))),
+    ]
+    ratio, *drawn = (
+        quantile_of_rounds([rounds[n] for n in numbers], share)
+        / quantile_of_rounds([reference[n] for n in numbers], share)
+        for numbers in chosen
+    )
+    low, high = np.percentile(drawn, (2.5, 97.5))
+    return f"{ratio:.2f} ({low:.2f} to {high:.2f})"
 
 
 def percent(share: float) -> str:

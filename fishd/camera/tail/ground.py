@@ -15,7 +15,7 @@ SMALL_WIDTH_PX = 180
 """Largest width of the small picture in which the tail is searched [px]."""
 _MIN_CONTRAST = 0.4
 """Smallest contrast of a place that can show the tail, relative to the typical one."""
-_MAX_LIGHT_CHANGE = 0.2
+_MAX_LIGHT_CHANGE = 0.35
 """Largest difference of the light of a row from that of the picture, relative."""
 _MIN_STILL_PIXELS = 6
 """Fewest pixels of a row that show its light."""

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from fishd.camera.axis import NoMotion, find_motion
 from fishd.camera.tail.ground import Floats, Ground, Mask, shrink
 from fishd.camera.tail.learned import ORDER, Learned
+from fishd.camera.tail.lens import Lens
 from fishd.camera.tail.profile import STATIONS, Array, Pose, Trace, Tracer, fit_line
+from fishd.camera.tail.scene import Scene
 from fishd.camera.tail.shape import Shape
 from fishd.core.camera_frames import Pixels
 from fishd.core.errors import FishdError
@@ -49,6 +51,9 @@ _MIN_WHOLE = 15
 """Fewest midlines without a gap that are sufficient."""
 _MAX_SHAPE_ERROR = 0.02
 """Largest distance of the midlines from their common shape, relative to the picture's width."""
+_WHITE, _MIN_DEVIATION = 0.5, 0.0005
+"""Addition to the learned variance of distances from the shape: a fraction of it, and the square
+of a distance relative to the picture's width."""
 _EDGE_PX = 4.0
 """Distance from the picture's edge at which the tail counts as cut off [px]."""
 
@@ -60,14 +65,18 @@ class CannotLearn(FishdError, ValueError):
 class Learner:
     """Collector of pictures, from which `finish` learns."""
 
-    def __init__(self) -> None:
+    def __init__(self, lens: Lens | None = None) -> None:
+        """lens: calibration of the camera; None without one"""
+        self._lens = lens
         self._pictures: list[tuple[float, Pixels]] = []
         self._size = (0, 0)
         self._seen = 0
         self._random = random.Random(0)
 
     def add(self, time: float, picture: Pixels) -> None:
-        """Take a whole turned picture of a time [s]; raise `CannotLearn` if its size changes.
+        """Take a whole turned picture of a time [s].
+
+        Raise `CannotLearn` if its size changes, and `CannotUseLens` if it is not that of the lens.
 
         Of many pictures, a random choice is kept, at half their size or 400 px wide.
         """
@@ -77,6 +86,8 @@ class Learner:
                 f"the pictures change from {self._size[0]} × {self._size[1]} to {size[0]} × "
                 f"{size[1]} pixels: learn from pictures of one size"
             )
+        if self._lens:
+            self._lens.check(size, self._lens.rotate)
         self._size = size
         self._seen += 1
         place = len(self._pictures)
@@ -100,10 +111,13 @@ class Learner:
         times = np.array([time for time, _ in self._pictures])
         pictures = [picture for _, picture in self._pictures]
         scene = _Scene(pictures, self._size[0] / pictures[0].shape[1])
-        traces = _trace_all(scene, pictures)
-        return self._summarise(scene, times, traces)
+        traces = _trace_all(scene, pictures, self._lens)
+        return self._summarise(scene, times, traces, _find_poses(scene.ground, pictures))
 
-    def _summarise(self, scene: "_Scene", times: Array, traces: list[Trace | None]) -> Learned:
+    def _summarise(
+        self, scene: "_Scene", times: Array, traces: list[Trace | None], poses: Array
+    ) -> Learned:
+        """poses: of the camera, 95 % of the pictures have smaller ones"""
         seen = [trace for trace in traces if trace is not None]
         if len(seen) < 0.6 * len(traces):
             raise CannotLearn(
@@ -116,7 +130,7 @@ class Learner:
         swing = points[..., 1].std(axis=0)
         if np.count_nonzero(weight.min(axis=1)) < _MIN_WHOLE or swing[0] > swing[-1]:
             raise CannotLearn(_NO_SHAPE)
-        scene.check_edges(points)
+        scene.check_edges(np.stack([trace.places for trace in seen]))
         fin = _find_fin(points, weight)
         first, last = _stations(fin)
         lines = [
@@ -132,7 +146,9 @@ class Learner:
                 f"too little swing to learn from: from {1e3 * low:.0f} to {1e3 * high:.0f} mrad; "
                 f"{1e3 * MIN_SWING_RAD:.0f} mrad to both sides of the zero are needed"
             )
-        shape, errors, differences = _learn_shape(alpha, points, weight, (low, high))
+        shape, errors, differences = _learn_shape(
+            alpha, points, weight, (low, high), _MIN_DEVIATION * scene.size[0]
+        )
         if np.quantile(errors, 0.95) > _MAX_SHAPE_ERROR * scene.size[0]:
             raise CannotLearn(_NO_SHAPE)
         scale = scene.factor
@@ -164,6 +180,11 @@ class Learner:
             shape_error=float(np.quantile(errors, 0.95)) * scale,
             direction_error=float(np.quantile(differences[:, 0], 0.95)),
             turn_error=float(np.quantile(differences[:, 1], 0.95)),
+            lens=self._lens,
+            pixels_per_mm=self._lens.pixels_per_mm if self._lens else None,
+            covariance=tuple(tuple(row.tolist()) for row in shape.covariance * scale**2),
+            shift_error=(float(poses[0]) * scale, float(poses[1]) * scale),
+            scene_turn_error=float(poses[2]),
         )
 
 
@@ -220,9 +241,9 @@ class _Scene:
 
     def _is_light(self, dark: Floats, light: Floats, moving: Mask) -> bool:
         """Return whether the tail is lighter than the ground, which goes on beyond the sweep."""
-        inner = moving & (cv2.erode(moving.astype(np.uint8), np.ones((7, 7), np.uint8)) == 0)
-        outer = cv2.dilate(moving.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-        ring = (outer & ~moving).astype(np.float32)
+        hull = _fill_columns(moving)  # a small swing leaves a middle that never moves
+        inner = moving & (cv2.erode(hull, np.ones((7, 7), np.uint8)) == 0)
+        ring = (cv2.dilate(hull, np.ones((9, 9), np.uint8)) - hull).astype(np.float32)
         total = cv2.blur(ring, (25, 25))
         near = inner & (total > 1e-3)
 
@@ -234,11 +255,7 @@ class _Scene:
 
     def _fill(self, empty: Array, moving: Mask) -> None:
         """Set the ground, also where the tail never leaves."""
-        hull = np.zeros(moving.shape, np.uint8)
-        for column in np.flatnonzero(moving.any(axis=0)):
-            rows = np.flatnonzero(moving[:, column])
-            hull[rows[0] : rows[-1] + 1, column] = 1
-        hull = np.asarray(cv2.dilate(hull, np.ones((5, 5), np.uint8)), np.uint8)
+        hull = np.asarray(cv2.dilate(_fill_columns(moving), np.ones((5, 5), np.uint8)), np.uint8)
         ground = np.median(empty[(cv2.dilate(hull, np.ones((15, 15), np.uint8)) > 0) & (hull == 0)])
         tail_like = np.abs(empty - self.tail_level) < np.abs(empty - ground)
         always = (tail_like & (hull > 0)).astype(np.uint8)
@@ -267,9 +284,8 @@ class _Scene:
         self.pose = self.pose._replace(root=(float(x), float(y)))
         self.ground = Ground(self.background, self.size, self.tail_level, self.swept)
 
-    def check_edges(self, points: Array) -> None:
+    def check_edges(self, places: Array) -> None:
         """Raise `CannotLearn` if the tail leaves the picture."""
-        places = self.pose.to_picture(points)
         if side := cut_off_side(places.reshape(-1, 2), self.size, 0.5 * _EDGE_PX):
             raise CannotLearn(
                 f"the tail leaves the picture at the {side}: raise the camera or let the fish "
@@ -284,6 +300,12 @@ def cut_off_side(places: Array, size: tuple[int, int], margin: float = _EDGE_PX)
     if places[:, 1].min() < margin:
         return "top"
     return "bottom" if places[:, 1].max() > size[1] - 1 - margin else ""
+
+
+def _fill_columns(mask: Mask) -> Pixels:
+    """Return 1 in each column from the first to the last row of a mask, else 0."""
+    filled = np.maximum.accumulate(mask, axis=0) & np.maximum.accumulate(mask[::-1], axis=0)[::-1]
+    return filled.astype(np.uint8)
 
 
 def _even_light(pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -313,7 +335,7 @@ def _to_levels(picture: Floats) -> Pixels:
     return np.asarray(np.clip(picture + 0.5, 0.0, 255.0), np.float32).astype(np.uint8)
 
 
-def _trace_all(scene: _Scene, pictures: list[Pixels]) -> list[Trace | None]:
+def _trace_all(scene: _Scene, pictures: list[Pixels], lens: Lens | None) -> list[Trace | None]:
     """Return the midlines, after the length of the tail has been found in some pictures."""
     tracer = Tracer(scene.ground, scene.pose, scene.half_width)
     some = [
@@ -323,8 +345,19 @@ def _trace_all(scene: _Scene, pictures: list[Pixels]) -> list[Trace | None]:
         raise CannotLearn(_NOTHING_SWINGS)
     scene.length = float(np.quantile([trace.length for trace in some], 0.6))
     scene.half = np.median([trace.half for trace in some], axis=0)
-    tracer = Tracer(scene.ground, scene.pose, scene.half_width, scene.length, scene.half)
+    tracer = Tracer(
+        scene.ground, scene.pose, scene.half_width, scene.length, scene.half, lens, scene.factor
+    )
     return [tracer.trace(picture) for picture in pictures]
+
+
+def _find_poses(ground: Ground, pictures: list[Pixels]) -> Array:
+    """Return the 95 % quantiles of shifts [px of these pictures] and turn [rad] of the scene."""
+    scene = Scene(ground)
+    small = [shrink(picture) for picture in pictures]
+    poses = [scene.find_pose(picture, ground.light(picture))[0] for picture in small]
+    quantiles = np.quantile(np.abs(poses), 0.95, axis=0)
+    return np.asarray(quantiles * (ground.scale, ground.scale, 1.0))
 
 
 def _stations(fin: tuple[float, float]) -> tuple[int, int]:
@@ -374,7 +407,7 @@ def _find_zero(times: Array, angle: Array) -> tuple[float, float]:
 
 
 def _learn_shape(
-    alpha: Array, points: Array, weight: Array, span: tuple[float, float]
+    alpha: Array, points: Array, weight: Array, span: tuple[float, float], min_deviation: float
 ) -> tuple[Shape, Array, Array]:
     """Return the shape, and the distances and differences of direction of pictures from it."""
     shape = Shape.learn(alpha, points, weight, ORDER)
@@ -383,6 +416,16 @@ def _learn_shape(
         errors = np.array([fit.error for fit in fits])
         usual = errors <= np.quantile(errors, 0.9)
         shape = Shape.learn(alpha[usual], points[usual], weight[usual], ORDER)
+    known = (errors <= np.quantile(errors, 0.95)) & (weight.min(axis=1) > 0.0)
+    distances = np.array(
+        [
+            shape.find_distances(each, shape.fit(each, np.ones(STATIONS), a, span).alpha)
+            for each, a in zip(points[known], alpha[known], strict=True)
+        ]
+    )
+    covariance = distances.T @ distances / max(len(distances), 1)
+    white = _WHITE * float(np.trace(covariance)) / STATIONS + min_deviation**2
+    shape = Shape(shape.coefficients, covariance + white * np.eye(STATIONS))
     fits = [shape.fit(*each, span) for each in zip(points, weight, alpha, strict=True)]
     differences = np.abs([(a - fit.alpha, fit.turn) for a, fit in zip(alpha, fits, strict=True)])
     return shape, np.array([fit.error for fit in fits]), differences

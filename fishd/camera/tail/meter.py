@@ -25,6 +25,7 @@ from fishd.camera.tail.profile import (
     Tracer,
     fit_line,
 )
+from fishd.camera.tail.scene import Scene
 from fishd.camera.tail.shape import Fit, Shape
 from fishd.core.camera_frames import Pixels
 from fishd.core.tail_reading import TailReading
@@ -45,19 +46,36 @@ _MAX_TURN_RAD = 0.03
 """Permitted turn of a midline about its root in one picture [rad]."""
 _USUAL = 3.0
 """Permitted error, relative to that of 95 % of the learned pictures, if that is larger."""
-_KNOCK_S = 0.8
-"""Time over which the turn of the midlines is averaged [s]."""
+_WAVE_GAIN, _SHAPE_GAIN = 1.8, 2.0
+"""Error of the fin's line by waves, in distances from it relative to its length, and half-width of
+the interval of the shape's angle, in `Fit.alpha_error`."""
+_MIN_WAVE_RAD = 0.006
+"""Difference of the line from the shape below which waves do not matter [rad]."""
+_SEEN_TURN = 2.5
+"""Factor of the permitted turns of a midline beside edges that show a turn of the camera."""
+_USUAL_TURN = 2.0
+"""Permitted turn, relative to that of 95 % of the learned pictures, if that is larger."""
+_KNOCK_S, _DOUBT_S = 0.8, 0.1
+"""Times over which the turn of the midlines is averaged, for the zero and for one picture [s]."""
 _KNOCK_RAD = 0.012
 """Mean turn above which the zero has moved [rad]."""
-_MEAN_TURN = 0.6
+_MEAN_TURN = 0.5
 """The same, relative to the turn that 95 % of single learned pictures stay below."""
-_MIN_KNOCK_READINGS = 5
+_MIN_KNOCK_READINGS, _MIN_DOUBT_READINGS = 5, 2
 _MIN_SIDE_READINGS = 6
 """Number of readings from which a side of the swing counts for itself."""
-_SCENE_S = 0.5
-"""Time for which something else is seen before the scene is compared with the background [s]."""
-_MAX_UNEXPLAINED = 0.15
-"""Largest part of what covers the ground that a turn of the background leaves unexplained."""
+_SCENE_S = 0.2
+"""Time between searches for the pose of a camera that has moved [s]."""
+_SCENE_STEPS = 10
+"""Number of steps of such a search."""
+_MAX_SHIFT, _MAX_SCENE_TURN_RAD = 0.004, 0.02
+"""Permitted shift, relative to the picture's width, and turn of the scene [rad]."""
+_SCENE_USUAL = 2.0
+"""The same, relative to that of 95 % of the learned pictures, if that is larger."""
+_MAX_DISAGREEMENT = 0.8
+"""Largest difference of the scene's edges that such a pose leaves, relative to that without."""
+_MAX_UNEXPLAINED = 0.25
+"""Largest part of what covers the ground that a move of the camera leaves unexplained."""
 _JUMP_RAD = 0.06
 """Permitted change between two pictures, in addition to that at the highest speed [rad]."""
 _JUMP_RATE = 1.5
@@ -66,8 +84,9 @@ _JUMP_S = 0.2
 """Longest time between two pictures whose change is judged [s]."""
 _SPAN = 1.25
 """Range of angles relative to that learned."""
-_MIN_REPEATED_RATE = 0.3
-"""Speed of the fin above which two equal pictures are one that the camera repeats [rad/s]."""
+_MIN_REPEATED_RATE, _STOP_S = 0.3, 0.15
+"""Recent speed of the fin above which two equal pictures are one that the camera repeats [rad/s],
+and the time constant with which it is forgotten, as a fin cannot stop at once [s]."""
 MIDLINE_POINTS = 16
 """Number of points of a midline."""
 
@@ -92,9 +111,11 @@ class TailMeter:
         self._half = np.array(learned.half_thickness)
         self._pose = Pose(learned.root, learned.direction)
         self._tracer = Tracer(
-            self._ground, self._pose, float(self._half.max()), learned.length, self._half
-        )
-        self._shape = Shape(np.array(learned.shape))
+            self._ground, self._pose, float(self._half.max()), learned.length, self._half,
+            learned.lens,
+        )  # fmt: skip
+        self._shape = Shape(np.array(learned.shape), np.array(learned.covariance))
+        self._scene = Scene(self._ground)
         first, last = learned.fin
         self._fin = slice(round((1.0 - last) * STATIONS), round((1.0 - first) * STATIONS))
         self._fin_length = learned.length * (last - first)
@@ -106,19 +127,31 @@ class TailMeter:
         self._max_difference = min(
             max(_MIN_DIFFERENCE_RAD, _USUAL * learned.direction_error), _MAX_DIFFERENCE_RAD
         )
-        self._max_turn = max(_MAX_TURN_RAD, _USUAL * learned.turn_error)
-        self._max_mean_turn = max(_KNOCK_RAD, _MEAN_TURN * learned.turn_error)
         self._turns: deque[tuple[float, float, bool]] = deque()
         """Time, turn, and whether the fin is on the positive side."""
-        self._foreign_since = math.inf
-        self._scene_moved = self._zero_moved = ""
+        usual = _SCENE_USUAL * np.array([*learned.shift_error, learned.scene_turn_error])
+        shift = _MAX_SHIFT * width
+        self._max_pose = np.maximum([shift, shift, _MAX_SCENE_TURN_RAD], usual)
+        """Permitted shift along the rows and down [px], and turn [rad]."""
+        # Half a pixel looks like a turn; the edges of a body show better whether there was one.
+        factor = 1.0 if self._scene.is_blind else _SEEN_TURN
+        self._max_turn = max(factor * _MAX_TURN_RAD, _USUAL_TURN * learned.turn_error)
+        self._max_mean_turn = max(factor * _KNOCK_RAD, _MEAN_TURN * learned.turn_error)
+        self._poses: list[Array] = []
+        """Poses of a camera that has moved."""
+        self._scene_searched = -math.inf
+        self._zero_moved = ""
         self._small: Pixels | None = None
         """Previous picture, shrunk."""
         self._last: tuple[float, float] | None = None
         self._rate = 0.0
         """Speed of the fin before `_last` [rad/s]."""
-        self._spread = learned.direction_error / 2.0
-        """Recent root mean square of the difference from the learned shape [rad]."""
+        self._motion = 0.0
+        """Largest recent speed of the fin [rad/s]."""
+        self._spread = (learned.direction_error / 2.0) ** 2
+        """Recent mean square of the difference from the learned shape [rad²]."""
+        self._waves = 0.0
+        """Recent mean square of the distances from the fin's line, in lengths of the fin."""
 
     def read(
         self, time: float, picture: Pixels, row_time: float = 0.0, column_time: float = 0.0
@@ -135,16 +168,16 @@ class TailMeter:
         except CannotUse as error:
             return TailReading(time=time, zero=zero, reason=str(error))
         small = shrink(picture)
-        is_repeated = self._small is not None and np.array_equal(small, self._small)
-        self._small = small
-        if is_repeated and abs(self._rate) > _MIN_REPEATED_RATE:
+        if self._small is None or not np.array_equal(small, self._small):
+            self._small = small
+        elif self._motion > _MIN_REPEATED_RATE:
             return TailReading(time=time, zero=zero, reason="the camera repeats a picture")
         light = self._ground.light(small)
         cover = self._ground.cover(small, light)
         trace = self._tracer.trace_cover(picture, light, cover)
         if trace is None:
             return TailReading(time=time, zero=zero, reason="no tail where it was learned")
-        places = self._pose.to_picture(trace.points)
+        places = trace.places
         middle = places[self._fin].mean(axis=0)
         height, width = picture.shape
         time += row_time * (float(middle[1]) / max(height - 1, 1) - 0.5)
@@ -156,17 +189,15 @@ class TailMeter:
             width - 1, 1
         )
         seen = self._look(trace, lag - lag[self._fin].mean(), time)
-        reason = self._find_fault(seen, small, cover, places, time)
+        reason = self._find_fault(seen, small, light, cover, places, time)
         alpha, uncertainty = None, None
         if not reason and seen is not None:
-            alpha = seen.alpha
+            alpha, uncertainty = self._weigh(seen)
             if self._last is not None and time > self._last[0]:
-                self._rate = (alpha - self._last[1]) / (time - self._last[0])
+                span = time - self._last[0]
+                self._rate = (alpha - self._last[1]) / span
+                self._motion = max(abs(self._rate), self._motion * math.exp(-span / _STOP_S))
             self._last = time, alpha
-            self._spread += 0.1 * (abs(alpha - seen.fit.alpha) - self._spread)
-            uncertainty = math.hypot(
-                2.5 * self._spread, 3.5 * seen.line.residual / self._fin_length, 5e-4
-            )
         return TailReading(
             time=time,
             alpha=alpha,
@@ -198,8 +229,33 @@ class TailMeter:
         alpha = line.angle - zero
         return _Seen(trace, line, self._shape.fit(points, weight, alpha, self._span), alpha)
 
+    def _weigh(self, seen: _Seen) -> tuple[float, float]:
+        """Return the fin angle and its half-width of a 95 % interval [rad].
+
+        Waves turn the line through the fin, and move the whole midline less. A fin that bends
+        differs from the learned shape, but remains smooth: then only its line is used.
+        """
+        line = seen.line.residual / self._fin_length
+        differs = seen.alpha - seen.fit.alpha
+        if self._last is None:
+            self._waves = line**2
+        self._waves += 0.1 * (line**2 - self._waves)
+        self._spread += 0.1 * (differs**2 - self._spread)
+        part = min(1.0, _WAVE_GAIN**2 * self._waves / max(self._spread, _MIN_WAVE_RAD**2))
+        spread = max(2.0 * math.sqrt(self._spread), abs(differs))
+        of_line = math.hypot(spread, 3.5 * line)
+        of_shape = _SHAPE_GAIN * seen.fit.alpha_error
+        uncertainty = math.hypot((1.0 - part) * of_line, part * of_shape, 5e-4)
+        return seen.alpha - part * differs, uncertainty
+
     def _find_fault(
-        self, seen: _Seen | None, small: Pixels, cover: Floats, places: Array, time: float
+        self,
+        seen: _Seen | None,
+        small: Pixels,
+        light: Floats,
+        cover: Floats,
+        places: Array,
+        time: float,
     ) -> str:
         """Return why the angle is unknown; empty if it is known."""
         place = self._find_foreign(small, cover, places)
@@ -209,22 +265,21 @@ class TailMeter:
             return _leaves(side) if side else moved or "no tail where it was learned"
         if side := cut_off_side(places, self.learned.size):
             return _leaves(side)
-        if moved:
+        if moved := moved or self._watch_scene(place is not None, small, light, time):
             return moved
-        self._watch_scene(place is not None, small, time)
-        if self._scene_moved:
-            return self._scene_moved
         if place is not None:
             return f"something else moves near column {place[0]}, row {place[1]}"
         if seen is None:
             return self._find_lamp(small, places) or "too little of the fin is seen"
-        if not self._span[0] < seen.alpha < self._span[1]:
+        differs = abs(seen.alpha - seen.fit.alpha) > self._max_difference
+        is_other = differs or seen.fit.error > self._max_error or self._is_turned(seen.fit.turn)
+        low, high = self._span if not is_other else self.learned.span
+        if not low < seen.alpha < high:
             return (
                 f"{1e3 * seen.alpha:.0f} mrad are beyond the swing that was learned: learn again "
-                "with a larger one"
+                "with the waves that are measured"
             )
-        differs = abs(seen.alpha - seen.fit.alpha) > self._max_difference
-        if differs or seen.fit.error > self._max_error or abs(seen.fit.turn) > self._max_turn:
+        if is_other:
             return self._find_lamp(small, places) or "the tail does not have the learned shape"
         if self._last is not None:
             before, angle = self._last
@@ -242,51 +297,60 @@ class TailMeter:
         if (
             seen is not None
             and seen.trace.weight.mean() > 0.9
+            and self.learned.span[0] <= seen.alpha <= self.learned.span[1]
             and seen.fit.error_turned
             < max(0.5 * _MAX_SHAPE_ERROR * self.learned.size[0], self.learned.shape_error)
         ):
             turns.append((time, seen.fit.turn, seen.alpha > 0.0))
         while turns and time - turns[0][0] > _KNOCK_S:
             turns.popleft()
-        if len(turns) < _MIN_KNOCK_READINGS or turns[-1][0] - turns[0][0] < 0.7 * _KNOCK_S:
-            return self._zero_moved
-        turn = float(np.median([turn for _, turn, _ in turns]))
-        sides = [[turn for _, turn, is_side in turns if is_side is side] for side in (False, True)]
-        if min(map(len, sides)) >= _MIN_SIDE_READINGS:
-            # A shape that differs from the learned one turns each side by another angle.
-            turn = min(turn, float(np.mean([np.median(side) for side in sides])), key=abs)
-        self._zero_moved = _zero_moved(turn) if abs(turn) >= self._max_mean_turn else ""
+        if len(recent := self._recent_turns(_KNOCK_S)) >= _MIN_KNOCK_READINGS:
+            turn = float(np.median([turn for turn, _ in recent]))
+            sides = [[turn for turn, is_side in recent if is_side is s] for s in (False, True)]
+            if min(map(len, sides)) >= _MIN_SIDE_READINGS:
+                # A shape that differs from the learned one turns each side by another angle.
+                turn = min(turn, float(np.mean([np.median(side) for side in sides])), key=abs)
+            self._zero_moved = _zero_moved(turn) if abs(turn) >= self._max_mean_turn else ""
         return self._zero_moved
 
-    def _watch_scene(self, is_foreign: bool, small: Pixels, time: float) -> None:
-        """Compare what stands still with the background, where it has not agreed for long."""
-        if not is_foreign:
-            self._foreign_since, self._scene_moved = math.inf, ""
-            return
-        self._foreign_since = min(self._foreign_since, time)
-        if time - self._foreign_since < _SCENE_S:
-            return
-        self._foreign_since = time
-        self._scene_moved = ""
-        still = self._ground.still.astype(np.uint8)
-        try:
-            _, transform = cv2.findTransformECC(
-                self._ground.background, small.astype(np.float32), np.eye(2, 3, dtype=np.float32),
-                cv2.MOTION_EUCLIDEAN,
-                (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4), still, 3,
-            )  # fmt: skip
-        except cv2.error:  # it does not converge
-            return
-        warp, flags = np.asarray(transform), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        turned = cv2.warpAffine(
-            small, warp, small.shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE
-        )
-        before, after = (
-            self._count_foreign(np.asarray(each, np.uint8)) for each in (small, turned)
-        )
-        turn = math.atan2(float(warp[1, 0]), float(warp[0, 0]))
-        if abs(turn) > _KNOCK_RAD and after < _MAX_UNEXPLAINED * before:
-            self._scene_moved = _zero_moved(turn)
+    def _recent_turns(self, span: float) -> list[tuple[float, bool]]:
+        """Return the turns of the latest time [s], and their sides; none if it has gaps."""
+        turns = self._turns
+        recent = [each for each in turns if each[0] >= turns[-1][0] - span]
+        if not recent or recent[-1][0] - recent[0][0] < 0.6 * span:
+            return []
+        return [(turn, is_side) for _, turn, is_side in recent]
+
+    def _is_turned(self, turn: float) -> bool:
+        """Return whether a midline is turned too much, or were those just before it."""
+        recent = [turn for turn, _ in self._recent_turns(_DOUBT_S)]
+        limit = self._max_mean_turn * math.sqrt(_KNOCK_S / _DOUBT_S)
+        is_doubtful = len(recent) >= _MIN_DOUBT_READINGS and abs(np.mean(recent)) > limit
+        return bool(abs(turn) > self._max_turn or is_doubtful)
+
+    def _watch_scene(self, is_foreign: bool, small: Pixels, light: Floats, time: float) -> str:
+        """Return how the camera has moved, if what stands still in the picture has.
+
+        Where something else is seen, it must be what a move of the camera explains.
+        """
+        unit = np.array([self._ground.scale, self._ground.scale, 1.0])
+        pose, _ = self._scene.find_pose(small, light)
+        if np.all(np.abs(unit * pose) <= self._max_pose):
+            self._poses.clear()
+            return ""
+        if not self._poses or not 0.0 <= time - self._scene_searched < _SCENE_S:
+            self._scene_searched = time
+            pose, agreement = self._scene.find_pose(small, light, _SCENE_STEPS)
+            undone = self._scene.undo(small, pose).astype(np.uint8)
+            before, after = self._count_foreign(small), self._count_foreign(undone)
+            if agreement > _MAX_DISAGREEMENT or (is_foreign and after > _MAX_UNEXPLAINED * before):
+                self._poses.clear()
+                return ""
+            self._poses.append(unit * pose)
+        along, down, turn = np.mean(self._poses, axis=0).tolist()
+        if abs(turn) > max(_KNOCK_RAD, self._max_pose[2] / math.sqrt(len(self._poses))):
+            return _zero_moved(turn)
+        return f"the camera has moved by {math.hypot(along, down):.0f} px: learn again"
 
     def _count_foreign(self, small: Pixels) -> int:
         """Return how many pixels that the tail never covers differ from the background."""

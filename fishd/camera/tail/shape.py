@@ -1,5 +1,6 @@
 """Midline of a tail as a function of its fin angle, as learned."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,8 @@ class Fit(NamedTuple):
     """Fin angle whose midline comes closest [rad]."""
     error: float
     """Root mean square of the distances that remain [px]."""
+    alpha_error: float
+    """Change of α that moves the midline by `error` [rad]."""
     turn: float
     """Angle by which the whole midline is turned about the root [rad]."""
     error_turned: float
@@ -25,9 +28,15 @@ class Fit(NamedTuple):
 class Shape:
     """Polynomials in α of the places of the stations along and across the axis."""
 
-    def __init__(self, coefficients: Array) -> None:
-        """coefficients: of the powers of α from 0, shape (order, 2, stations) [px]"""
+    def __init__(self, coefficients: Array, covariance: Array | None = None) -> None:
+        """
+        coefficients: of the powers of α from 0, shape (order, 2, stations) [px]
+        covariance: of the distances of the stations from a midline, (stations, stations) [px²]
+        """
         self.coefficients = coefficients
+        stations = coefficients.shape[2]
+        self.covariance = np.eye(stations) if covariance is None else covariance
+        self._information = np.linalg.inv(self.covariance)
         self._derivative = coefficients[1:] * np.arange(1, len(coefficients))[:, None, None]
 
     @classmethod
@@ -75,10 +84,21 @@ class Shape:
         error = float(np.sqrt(weight @ distance**2 / total))
         arm = self.midline(alpha) - self.coefficients[0, :, 0]
         turning = normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]
-        table = np.stack([slope, turning, np.ones(len(points))], axis=1) * weight[:, None]
-        solution = np.linalg.lstsq(table, weight * distance, rcond=None)[0]
-        rest = weight * distance - table @ solution
-        return Fit(alpha, error, float(solution[1]), float(np.sqrt(rest @ rest / total)))
+        table = np.stack([slope, turning, np.ones(len(points))], axis=1)
+        information, seen = self._information, np.flatnonzero(weight)
+        if len(seen) < len(points):
+            information = np.zeros_like(information)
+            information[np.ix_(seen, seen)] = np.linalg.inv(self.covariance[np.ix_(seen, seen)])
+        weighted = table.T @ information
+        solution = np.linalg.lstsq(weighted @ table, weighted @ distance, rcond=None)[0]
+        rest = distance - table @ solution
+        error_turned = float(np.sqrt(weight @ rest**2 / total))
+        alpha_error = error * math.sqrt(total / max(float(weight @ slope**2), 1e-9))
+        return Fit(alpha, error, alpha_error, float(solution[1]), error_turned)
+
+    def find_distances(self, points: Array, alpha: float) -> Array:
+        """Return the distances of a midline from that at α, positive to higher rows [px]."""
+        return self._distances(points, alpha)[0]
 
     def _distances(self, points: Array, alpha: float) -> tuple[Array, Array, Array]:
         """Return distances from the midline at α, its change with α, and its normals."""

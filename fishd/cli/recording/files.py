@@ -14,14 +14,18 @@ from fishd.cli.output import echo, format_count, print_json, print_json_line, pr
 from fishd.cli.verbs import pause_garbage_collector
 from fishd.core import files
 from fishd.core.addresses import control_address, find_control_address
+from fishd.core.errors import FishdError
 from fishd.core.process.interruption import raise_on_first_signal
 from fishd.recording import Run, open_run
 from fishd.recording.folder import (
+    EXPERIMENT,
     FOLDER_VARIABLE,
     check_new_files,
     find_recording,
+    list_recordings,
     runs_folder,
 )
+from fishd.recording.part_file import SUFFIX
 from fishd.recording.reader import RECOVERED
 
 folder_option = click.option(
@@ -107,7 +111,7 @@ def export(
 
 
 @click.command()
-@click.argument("run")
+@click.argument("runs", nargs=-1, required=True, metavar="RUN...")
 @click.option(
     "--from", "begin", type=FiniteRange(min=0), default=0.0, help="Begin at this time [s]."
 )
@@ -120,7 +124,7 @@ def export(
 @json_option
 @pause_garbage_collector()
 def plot(
-    run: str,
+    runs: tuple[str, ...],
     begin: float,
     end: float | None,
     target: Path | None,
@@ -132,28 +136,62 @@ def plot(
 
     RUN is a path, a name in the folder of recordings, or 'latest'. Of an experiment, its last
     recording is drawn; of a measurement, its drift and its thrust; of a training, its progress.
+    Several runs are drawn over each other, each from the beginning of its swim; one without a
+    recording is left out.
     """
-    from fishd.lab.experiment import HEADER
-    from fishd.lab.run_figure import draw_run
+    from fishd.lab.run_figure import draw_run, draw_runs
     from fishd.lab.run_traces import traces
 
-    experiment = files.expand_user(run) if "/" in run else (folder or runs_folder()) / run
-    if (experiment / HEADER).is_file():
-        if begin or end is not None:
-            raise click.UsageError("--from and --until are for a recording, not an experiment")
-        path = target or experiment
-        path = path / f"{experiment.name}.png" if path.is_dir() else path
-        check_new_files([path], replace=force)
+    experiments = [_find_experiment(run, folder) for run in runs]
+    if any(experiments) and (begin or end is not None):
+        raise click.UsageError("--from and --until are for a recording, not an experiment")
+    if len(runs) == 1 and (experiment := experiments[0]):
+        path = _picture_path(target or experiment, experiment.name, force)
         _draw_experiment(experiment, path)
         print_paths([path], as_json)
         return
-    recorded = open_recording(run, folder)
-    run_traces = traces(recorded, begin, math.inf if end is None else end)
-    path = target or recorded.path.parent
-    path = path / f"{recorded.name}.png" if path.is_dir() else path
-    check_new_files([path], replace=force)
-    draw_run(run_traces, path)
+    pairs = list(zip(runs, experiments, strict=True))
+    recordings = {
+        experiment.name if experiment else run: _open_plotted(run, experiment, folder)
+        for run, experiment in pairs
+    }
+    left_out = [name for name, recording in recordings.items() if recording is None]
+    kept = {name: recording for name, recording in recordings.items() if recording}
+    if not kept:
+        raise FishdError(f"nothing can be drawn: no recording in {', '.join(left_out)}")
+    last = math.inf if end is None else end
+    drawn = {name: traces(recording, begin, last) for name, recording in kept.items()}
+    first = next(iter(kept.values()))
+    name = first.name if len(runs) == 1 else f"{first.name}-compared"
+    path = _picture_path(target or first.path.parent, name, force)
+    if len(runs) == 1:
+        draw_run(drawn[runs[0]], path)
+    else:
+        draw_runs(
+            {n.rpartition("/")[2].removesuffix(SUFFIX): t for n, t in drawn.items()}, left_out, path
+        )
     print_paths([path], as_json)
+
+
+def _picture_path(target: Path, name: str, force: bool) -> Path:
+    """Return the file of a picture: the target, or this name in that folder."""
+    path = target / f"{name}.png" if target.is_dir() else target
+    check_new_files([path], replace=force)
+    return path
+
+
+def _find_experiment(run: str, folder: Path | None) -> Path | None:
+    """Return the folder of an experiment; None for a recording."""
+    path = files.expand_user(run) if "/" in run else (folder or runs_folder()) / run
+    return path if (path / EXPERIMENT).is_file() else None
+
+
+def _open_plotted(run: str, experiment: Path | None, folder: Path | None) -> Run | None:
+    """Open a recording, or the last one of an experiment; None for one without a recording."""
+    if experiment is None:
+        return open_recording(run, folder)
+    recordings = list_recordings(experiment)
+    return open_run(recordings[-1]) if recordings else None
 
 
 def _draw_experiment(folder: Path, path: Path) -> None:

@@ -1,6 +1,7 @@
-"""The verb that lists recordings."""
+"""The verb that lists recordings and experiments; `fishd.cli.recording.stored` has its verbs."""
 
 import shlex
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from msgspec import Struct
 
 from fishd.cli.options import json_option
 from fishd.cli.output import echo, echo_table, format_count, print_json
+from fishd.cli.recording import stored
 from fishd.cli.recording.files import folder_option
 from fishd.core import text
 from fishd.core.console import format_power
@@ -23,24 +25,29 @@ from fishd.lab.experiment import (
     list_experiments,
 )
 from fishd.recording.folder import Overview, read_overviews, runs_folder
+from fishd.recording.notes import read_note
 from fishd.recording.summary import Summary
 
 MAX_DURATION_S = 1e9
 """Longest duration that is shown as hours and minutes, about thirty years [s]."""
 
 
-@click.command()
+@click.group(invoke_without_command=True)
 @folder_option
 @json_option
-def runs(folder: Path | None, as_json: bool) -> int:
+@click.pass_context
+def runs(ctx: click.Context, folder: Path | None, as_json: bool) -> int:
     """List recordings and experiments, each the oldest first, by their running numbers.
 
     'thrust' is the mean while the fish swam, in mN unless another unit is shown, with its 95 %
     confidence interval, which includes the calibration where that is known. If the zero of the
     sensor was never known, it is the mean measured force with drift and offset, and its interval is
-    '?'. An experiment shows its result or, before its end, the largest thrust so far.
+    '?'. An experiment shows its result or, before its end, the largest thrust so far; a search
+    shows none before its end.
     'power' is the mean power into the servo. 'lost' counts ticks of fishd that are not in the file.
     """
+    if ctx.invoked_subcommand:
+        return 0
     place = folder or runs_folder()
     recordings = list(read_overviews(place))
     readable = [entry for entry in recordings if isinstance(entry, Overview)]
@@ -59,6 +66,10 @@ def runs(folder: Path | None, as_json: bool) -> int:
     for problem in problems:
         echo(f"fishctl: {problem}", err=True)
     return 1 if problems else 0
+
+
+for verb in stored.VERBS:
+    runs.add_command(verb)
 
 
 class _ExperimentSummary(Struct):
@@ -88,13 +99,19 @@ class _ExperimentSummary(Struct):
     """Reason why it cannot be read; empty if it can."""
     number: int = 0
     """Running number, which gives the order; 0 without one."""
+    duration: float | None = None
+    """Tank time of the result, else time from begin to end; None where neither is known [s]."""
+    about: dict[str, str] = {}
+    """Note of the experiment, if it has one."""
 
     @classmethod
     def read(cls, path: Path, header: "Header | ConfigError") -> "_ExperimentSummary":
         """Return the summary of an experiment."""
         if isinstance(header, ConfigError):
-            return cls(path.name, str(path), "–", "–", "", None, "", problem=str(header))
-        answer = find_answer(path)
+            about = read_note(path)
+            problem = str(header)
+            return cls(path.name, str(path), "–", "–", "", None, "", problem=problem, about=about)
+        answer = find_answer(path, header.kind)
         return cls(
             path.name,
             str(path),
@@ -108,7 +125,17 @@ class _ExperimentSummary(Struct):
             number=header.number,
             command=header.command,
             problem=answer.problem,
+            duration=_find_duration(header) if answer.seconds is None else answer.seconds,
+            about=read_note(path),
         )
+
+
+def _find_duration(header: Header) -> float | None:
+    """Return the time from the begin to the end of an experiment [s]; None where it is unknown."""
+    with suppress(ValueError, TypeError):  # TypeError: only one of them has a time zone
+        begin, end = map(datetime.fromisoformat, (header.began, header.ended or ""))
+        return max(0.0, (end - begin).total_seconds())
+    return None
 
 
 def _find_state(path: Path, header: Header) -> str:
@@ -124,7 +151,7 @@ def _print_experiments(experiments: list[_ExperimentSummary]) -> None:
     table.add_column("experiment", overflow="fold")
     table.add_column("began", no_wrap=True)
     table.add_column("command", overflow="fold")
-    for head in ("rows", "thrust"):
+    for head in ("length", "rows", "thrust"):
         table.add_column(head, justify="right", no_wrap=True)
     table.add_column("about", overflow="fold")
     for experiment in experiments:
@@ -132,6 +159,7 @@ def _print_experiments(experiments: list[_ExperimentSummary]) -> None:
             text.line(experiment.name),
             _format_start(experiment.began),
             text.line(f"{experiment.kind} {shlex.join(experiment.command)}".strip()),
+            "–" if experiment.duration is None else _format_duration(experiment.duration),
             "–" if experiment.rows is None else str(experiment.rows),
             _format_thrust(experiment),
             _format_about(experiment),
@@ -141,7 +169,8 @@ def _print_experiments(experiments: list[_ExperimentSummary]) -> None:
 
 def _format_about(experiment: _ExperimentSummary) -> str:
     state = "" if experiment.state == "finished" else experiment.state
-    return "; ".join(filter(None, [state, experiment.summary]))
+    note = text.line(experiment.about.get("note", ""))
+    return "; ".join(filter(None, [state, experiment.summary, note]))
 
 
 def _to_json(glance: Overview) -> dict[str, Any]:

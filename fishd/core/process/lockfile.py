@@ -8,10 +8,13 @@ import errno
 import fcntl
 import os
 import stat
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+RETRY_PERIOD_S = 0.02
+"""Time between two attempts to take a lock [s]."""
 _KERNEL_LOCKS = Path("/proc/locks")
 """The kernel's list of locks and the processes that hold them."""
 _SAFE_OPEN_FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
@@ -38,14 +41,23 @@ def lock_path(path: Path) -> Path:
 
 
 @contextmanager
-def locked(path: Path, *, remove: bool = False) -> Iterator[None]:
+def locked(path: Path, *, remove: bool = False, timeout: float = 0.0) -> Iterator[None]:
     """Hold the lock of `path`, and create the lock file if it does not exist.
 
     remove: remove the lock file at the end, if that is permitted
+    timeout: longest wait for a process that holds it [s]
     Raise `LockHeld` if a process holds it, this one included, OSError if it cannot be created, and
     `NotALock`, an OSError, if the path is something else.
     """
-    lock = _acquire_lock(path)
+    deadline = time.monotonic() + timeout
+    while True:
+        try:
+            lock = _acquire_lock(path)
+            break
+        except LockHeld:
+            if time.monotonic() >= deadline:
+                raise
+            time.sleep(RETRY_PERIOD_S)
     try:
         os.ftruncate(lock, 0)
         os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)

@@ -2,12 +2,19 @@
 
 import math
 import os
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fishd.lab.drawing import BLACK, BLUE, GREY, ORANGE, open_figure
-from fishd.lab.identification.result import PRODUCT_UNITS, Estimate, Fit, Identification
+from fishd.lab.identification.response import Array
+from fishd.lab.identification.result import (
+    PRODUCT_UNITS,
+    Channel,
+    Estimate,
+    FinAngleFit,
+    Identification,
+)
 from fishd.lab.statistics import Z95
 
 _EXTRACT_S = 6.0
@@ -40,50 +47,76 @@ _PRODUCTS = dict(zip(PRODUCT_UNITS, ("K λ²", "K_y λ", "K_d λ"), strict=True)
 
 def draw(identification: Identification, path: str | os.PathLike[str]) -> None:
     """Draw an identification into a file; raises `FishdError` where it cannot be written."""
-    with open_figure(path, (10.0, 6.5)) as figure:
-        axes = figure.subplots(2, 3, width_ratios=(3.0, 3.0, 1.6))
-        for channel, (row, symbol) in enumerate(zip(axes, ("F_x", "F_y"), strict=True)):
-            _draw_forces(row[0], identification.fit, channel, symbol)
-            residual = 1e3 * (identification.fit.measured - identification.fit.simulated)[channel]
-            drift = 1e3 * identification.fit.drift[channel]
-            _draw_residual(row[1], identification, channel, residual, drift)
-            _draw_correlation(row[2], residual - drift)
-        handles = [line for axis in axes[1][:2] for line in axis.get_legend_handles_labels()[0]]
+    fit, tail = identification.fit, identification.fin_angle
+    outputs = [
+        _Output(
+            f"$F_{axis}$",
+            "mN",
+            fit.times,
+            fit.measured[k],
+            fit.simulated[k],
+            fit.drift[k],
+            identification.channels[k],
+        )
+        for k, axis in enumerate("xy")
+    ]
+    if tail:
+        none = np.zeros(len(tail.times))
+        outputs.append(_Output("α", "mrad", tail.times, tail.measured, tail.simulated, none, tail))
+    with open_figure(path, (10.0, 3.25 * len(outputs))) as figure:
+        axes = figure.subplots(len(outputs), 3, width_ratios=(3.0, 3.0, 1.6))
+        for row, output in zip(axes, outputs, strict=True):
+            _draw_extract(row[0], output)
+            _draw_residual(row[1], output)
+            _draw_correlation(row[2], output.residual - output.drift)
+        handles = [line for axis in axes[0][:2] for line in axis.get_legend_handles_labels()[0]]
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
 
 
-def _draw_forces(axis: Any, fit: Fit, channel: int, symbol: str) -> None:
-    """Plot an extract of measured forces, and of the fit with the drift of the sensor."""
-    middle = np.nanmedian(fit.times)
-    extract = np.abs(fit.times - middle) <= 0.5 * _EXTRACT_S
-    times = fit.times[extract]
-    simulated = 1e3 * (fit.simulated + fit.drift)[channel, extract]
+class _Output(NamedTuple):
+    """Forces or fin angles, and those of the identified fish; arrays of equal length."""
+
+    symbol: str
+    unit: str
+    """Thousandth of the unit of the arrays."""
+    times: Array
+    measured: Array
+    simulated: Array
+    drift: Array
+    result: Channel | FinAngleFit
+
+    @property
+    def residual(self) -> Array:
+        """Return what is measured minus that of the fish, with the drift."""
+        return np.asarray(self.measured - self.simulated)
+
+
+def _draw_extract(axis: Any, output: _Output) -> None:
+    """Plot an extract of what was measured, and of the fit with the drift of the sensor."""
+    times = output.times
+    extract = np.abs(times - np.nanmedian(times)) <= 0.5 * _EXTRACT_S
     style = {"color": BLACK, "markersize": 3.0, "linestyle": "none"}
-    axis.plot(times, 1e3 * fit.measured[channel, extract], marker=".", label="measured", **style)
-    axis.plot(times, simulated, color=BLUE, linewidth=0.9, label="identified fish + drift")
-    axis.set_ylabel(f"${symbol}$ (mN)")
+    axis.plot(times[extract], 1e3 * output.measured[extract], marker=".", label="measured", **style)
+    simulated = 1e3 * (output.simulated + output.drift)[extract]
+    axis.plot(times[extract], simulated, color=BLUE, linewidth=0.9, label="identified fish + drift")
+    axis.set_ylabel(f"{output.symbol} ({output.unit})")
     axis.set_xlabel("time (s)")
-    axis.set_title(f"${symbol}$, mean of each tick")
+    each = "each picture" if isinstance(output.result, FinAngleFit) else "mean of each tick"
+    axis.set_title(f"{output.symbol}, {each}")
 
 
-def _draw_residual(
-    axis: Any, identification: Identification, channel: int, residual: Any, drift: Any
-) -> None:
-    result = identification.channels[channel]
-    axis.plot(
-        identification.fit.times,
-        residual,
-        color=GREY,
-        linewidth=0.4,
-        label="measured − identified fish",
-    )
-    axis.plot(
-        identification.fit.times, drift, color=ORANGE, linewidth=1.2, label="offset and drift"
-    )
-    axis.set_ylabel("residual (mN)")
+def _draw_residual(axis: Any, output: _Output) -> None:
+    """Plot what the fish does not explain, and the drift."""
+    style = {"color": GREY, "linewidth": 0.4, "label": "measured − identified fish"}
+    axis.plot(output.times, 1e3 * output.residual, **style)
+    if np.any(output.drift):
+        style = {"color": ORANGE, "linewidth": 1.2, "label": "offset and drift"}
+        axis.plot(output.times, 1e3 * output.drift, **style)
+    axis.set_ylabel(f"residual ({output.unit})")
     axis.set_xlabel("time (s)")
-    title = f"{result.explained:.2%} explained, noise {result.noise * 1e3:.2f} mN"
-    axis.set_title(title)
+    result = output.result
+    noise = f"{result.noise * 1e3:.2f} {output.unit}"
+    axis.set_title(f"{result.explained:.2%} explained, noise {noise}")
 
 
 def _draw_correlation(axis: Any, residual: Any) -> None:

@@ -100,7 +100,7 @@ class Fit:
     """Offset and drift of the sensor, smoothed, shape (2, n) [N]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FinAngleFit:
     """The camera that measured the fin angle, and its agreement with the identified fish."""
 
@@ -114,10 +114,17 @@ class FinAngleFit:
     """Number of fin angles."""
     left_out: int
     """Number of those that were left out, as they deviate too much."""
+    times: Array
+    """Times of all fin angles, as in `Fit`."""
+    measured: Array
+    """Fin angles in the direction of φ_c [rad]."""
+    simulated: Array
+    """Fin angles of the identified fish, with the zero of the camera [rad]."""
 
     def to_builtins(self) -> dict[str, Any]:
-        """Return everything, for JSON."""
-        return vars(self) | {"estimates": {e.name: _to_builtins(e) for e in self.estimates}}
+        """Return everything but the arrays, for JSON."""
+        numbers = {name: vars(self)[name] for name in ("explained", "noise", "used", "left_out")}
+        return numbers | {"estimates": {e.name: _to_builtins(e) for e in self.estimates}}
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from fishd.lab.identification.fit import BOUNDS, DRIVE, LOGARITHMIC, STEPS, Problem
@@ -112,7 +113,7 @@ class _Camera:
     Attributes:
         names: names of the fitted parameters of the fish.
         start: values before an update, as in `_Update`.
-        angles, errors: fin angles and their standard errors [rad].
+        times, angles, errors: fin angles, their times [s] and standard errors [rad].
         sign: -1 for a mirrored picture, whose angles have been mirrored again; else 1.
         blocks: begins of blocks of fin angles whose errors are independent.
     """
@@ -140,6 +141,7 @@ class _Camera:
                 "swings is needed"
             )
         delay, zero, self.sign = self._find_start(fin.angles[kept])
+        self.times = fin.times[kept]
         self.angles, self.errors = self.sign * fin.angles[kept], fin.errors[kept]
         self.start = np.concatenate((problem.to_z(values), (delay, self.sign * zero, 0.0)))
         numbers = np.floor(np.concatenate(self._times) / _BLOCK_S)
@@ -217,6 +219,7 @@ def add_fin_angles(
     x, covariance = update.x, update.covariance
     if scale_is_free:
         covariance[-1, -1] += scale_error**2
+    residual = update.residual[update.kept]
     fit = FinAngleFit(
         estimates=tuple(
             Estimate(name, value, value - half_width, value + half_width)
@@ -227,10 +230,13 @@ def add_fin_angles(
                 strict=False,
             )
         ),
-        explained=float(1.0 - np.var(update.residual) / np.var(camera.angles)),
-        noise=float(np.sqrt(np.mean(update.residual**2))),
-        used=len(update.residual),
-        left_out=len(camera.angles) - len(update.residual),
+        explained=float(1.0 - np.var(residual) / np.var(camera.angles)),
+        noise=float(np.sqrt(np.mean(residual**2))),
+        used=len(residual),
+        left_out=len(camera.angles) - len(residual),
+        times=camera.times,
+        measured=camera.angles,
+        simulated=camera.angles - update.residual,
     )
     change = np.sqrt(np.maximum(np.diag(prior) - np.diag(covariance), 0.1 * np.diag(prior)))
     changes = np.delete(np.abs(x - camera.start) / change, [len(x) - 3, len(x) - 2])
@@ -245,13 +251,15 @@ def add_fin_angles(
 
 
 class _Update(NamedTuple):
-    """Result of an update, and what is left of the fin angles that were used."""
+    """Result of an update, and what is left of the fin angles."""
 
     x: Array
     """Fitted parameters as in a `Problem`; delay [s], zero [rad] and log scale of the camera."""
     covariance: Array
     residual: Array
-    """[rad]"""
+    """Measured minus predicted, of all fin angles [rad]."""
+    kept: NDArray[np.bool_]
+    """Which of them are used."""
     noise: float
     """Rms of the residual, relative to the stated errors; at least 1."""
 
@@ -277,7 +285,7 @@ def _update(camera: _Camera, prior: Array) -> _Update:
     scores = np.add.reduceat(weighted * residual[:, None], camera.blocks, axis=0)
     robust = gain @ prior @ gain.T + covariance @ (scores.T @ scores) @ covariance
     wider = np.sqrt(np.maximum(np.diag(robust) / np.maximum(np.diag(covariance), 1e-300), 1.0))
-    return _Update(x, covariance * np.outer(wider, wider), residual[kept], noise)
+    return _Update(x, covariance * np.outer(wider, wider), residual, kept, noise)
 
 
 def _keep_in_bounds(names: Sequence[str], x: Array, covariance: Array) -> Array:

@@ -4,13 +4,15 @@ import {
 } from "./common.js";
 import { About } from "./about.js";
 import { Camera } from "./camera.js";
+import { ChartTools, MarkForm } from "./chart_tools.js";
 import { Charts } from "./charts.js";
 import { Drive, driverName, request } from "./controls.js";
 import { Experiments, plain, triedThrust } from "./experiments.js";
 import { defaultOf } from "./fields.js";
 import { TopView } from "./fish.js";
+import { Ring, ticksOf } from "./ring.js";
 import { Runs } from "./runs.js";
-import { Ring, Stream, ticksOf } from "./stream.js";
+import { Stream } from "./stream.js";
 import { Health, thrustTexts, Values } from "./values.js";
 
 const byId = (id) => document.getElementById(id);
@@ -30,7 +32,6 @@ const NOTICE_MS = { info: 6_000, warning: 20_000, error: 20_000 };
 const MAX_EVENTS = 100;
 /** Beginning of the name of the lease under which a page drives. */
 const OWN_LEASE = "window: ";
-const WINDOWS = [15, 30, 60, 120];
 /** Parts of the page, by the last part of its address. */
 const PLACES = { live: "Live", experiments: "Experiments", runs: "Runs", fish: "Fish" };
 
@@ -38,9 +39,9 @@ const state = {
   name: "", fish: [], session: null, status: null, controllers: [], events: [], jobs: new Map(),
   connection: null, driver: null, linked: false, helloed: false, refused: "", lastTick: null, tick: null, interval: 0.05,
   changedSeq: 0, own: new Set(), selected: null, edited: null, keep: recall("keep", false), estop: null,
-  notices: [], reference: null, seconds: recall("seconds", 15), isCameraOpen: recall("camera", false), heard: performance.now(),
+  notices: [], reference: null, isCameraOpen: recall("camera", false), heard: performance.now(),
 };
-let ring = new Ring(0.05), charts, view, stream, drawing = false, valuesAt = 0;
+let ring = new Ring(0.05), charts, view, stream, drawing = false, valuesAt = 0, later = 0;
 /** Number of connections in a row that ended without a first message. */
 let failures = 0;
 
@@ -68,6 +69,10 @@ const receive = {
     document.body.classList.remove("waiting");
     changed();
   },
+  /** Take a part of ten minutes: the extremes of bins. */
+  past(columns) {
+    for (const row of ticksOf(columns)) ring.past.add(row.time, row);
+  },
   /** Take a part of the history. */
   history(columns) {
     for (const tick of ticksOf(columns)) ring.push(tick);
@@ -87,7 +92,7 @@ const receive = {
     const before = state.tick;
     state.tick = ticks.at(-1);
     state.lastTick = now;
-    charts.dirty = true;
+    charts.advance();
     if (before?.mode !== state.tick.mode && state.status) state.status = { ...state.status, mode: state.tick.mode };
     schedule();
     checkConnection();
@@ -122,7 +127,7 @@ const receive = {
     if (job.state === "dismissed") state.jobs.delete(job.id);
     else state.jobs.set(job.id, job);
     if (before?.state === "running" && job.state !== "running") {
-      notice(job.state === "failed" ? "error" : "info", `${job.kind}: ${job.state}`, job.state === "failed" ? plain(job.lines?.at(-1) ?? "") : "");
+      notice(job.state === "failed" ? "error" : "info", `${job.kind}: ${job.state}`, job.state === "failed" || job.kind === "queue" ? plain(job.lines?.at(-1) ?? "") : "");
     }
     changed();
   },
@@ -471,6 +476,8 @@ function renderAll() {
   render(state.place === "fish" && state.name ? html`<${About} fish=${state.name} isPaired=${state.session?.paired} />` : null, byId("about"));
   render(html`<${Banner} />`, byId("banner"));
   render(html`<${Drive} ...${shared} />`, byId("drive"));
+  render(html`<${ChartTools} ...${{ charts, shownName }} />`, byId("chart-head"));
+  render(charts.cursor !== null && html`<${MarkForm} ...${{ charts, state, act }} />`, byId("chart-foot"));
   render(html`<${Experiments} ...${shared} />`, byId("experiments"));
   render(html`<${Runs} ...${shared} />`, byId("runs"));
   render(html`<${Events} />`, byId("events"));
@@ -517,7 +524,11 @@ function drawFrame(now) {
   if (state.place === "live") view.draw(state.tick);
   const tail = !state.tick ? "tail" : state.tick.alpha === undefined ? "tail, as commanded" : "tail, true";
   if (byId("tail-key").textContent !== tail) byId("tail-key").textContent = tail;
-  if (charts.dirty) schedule();
+  if (!charts.dirty || later) return;
+  later = setTimeout(() => {
+    later = 0;
+    schedule();
+  }, charts.waitMs(now));
 }
 
 function buildStaticParts() {
@@ -526,16 +537,6 @@ function buildStaticParts() {
     <p class="keys"><span class="key-phi">command φ<sub>c</sub></span><span class="key-body" id="tail-key">tail</span></p>
     <p class="keys"><button type="button" class="link" id="show-camera" onClick=${() => showCamera(true)}>show the camera</button></p>`, byId("view"));
   view = new TopView(byId("fish"));
-  const section = byId("charts");
-  render(html`<div class="head-row"><h2 id="charts-title">Live</h2>
-    <span class="keys"><span class="key-suspect">suspect sample</span><span class="key-gap">no ticks</span><span class="key-mark">change</span></span>
-    <label class="row">Show the last <select id="seconds" value=${state.seconds} onChange=${(event) => {
-      state.seconds = Number(event.target.value);
-      remember("seconds", state.seconds);
-      charts.setSeconds(state.seconds);
-      schedule();
-    }}>${WINDOWS.map((seconds) => html`<option value=${seconds}>${seconds} s</option>`)}</select></label></div>
-    <div id="plots"></div>`, section);
   const banner = byId("banner"), header = document.querySelector("header");
   const noteHeights = new ResizeObserver(() => {
     document.documentElement.style.setProperty("--banner", `${banner.offsetHeight}px`);
@@ -543,7 +544,7 @@ function buildStaticParts() {
   });
   noteHeights.observe(banner);
   noteHeights.observe(header);
-  charts = new Charts(byId("plots"), state.seconds);
+  charts = new Charts(byId("plots"), { changed, say });
   charts.setRing(ring);
 }
 

@@ -1,288 +1,47 @@
-// The charts: one uPlot each, made once; only their data, titles and ranges change.
-import { forceUnit, number, unitText } from "./common.js";
-import { QUANTITY, READING } from "./stream.js";
+// All charts of a fish over one common time, with one cursor.
+import { Chart, readPalette } from "./chart.js";
+import { Arrangement, CHARTS, namedChart, namedColumns } from "./chart_list.js";
+import { forceUnit, number, recall, remember, timeOfDay } from "./common.js";
+import { pressKey } from "./gestures.js";
+import { View } from "./view.js";
 
-const HEIGHT = 132;
 /** Number of charts for the quantities of a controller and the readings of sensors. */
 const NAMED_CHARTS = 20;
-const FRAME_MS = 50;
-/** A range shrinks when its values fill less than this fraction of it. */
-const SHRINK = 0.45;
+/** Shortest and longest time between two drawings, and the time with reduced motion [ms]. */
+const FRAME_MS = 50, SLOW_FRAME_MS = 250, REDUCED_FRAME_MS = 1000;
+const MAX_MARKS = 64;
+/** A mark at a tick of the past: its text ends with the tick. */
+const MARK_AT = /^(.*?) \(tick (\d+)\)$/s;
 
-const palette = {};
-const COLOURS = ["fx", "fy", "phi", "fin", "alpha", "thrust", "virtual", "band", "suspect", "grid", "muted", "mark"];
-function readPalette() {
-  const style = getComputedStyle(document.documentElement);
-  for (const name of COLOURS) palette[name] = style.getPropertyValue(`--${name}`).trim();
-}
-const colour = (name) => () => palette[name];
-
-const line = (column, name, more = {}) => ({ column, stroke: colour(name), width: 1.5, ...more });
-const points = (column) => ({
-  column,
-  stroke: colour("suspect"),
-  paths: () => null,
-  points: { show: true, size: 7, fill: colour("suspect"), stroke: colour("suspect") },
-});
-const invisible = (column) => ({ column, width: 0, points: { show: false }, aside: true });
-
-/** Charts: key, title, unit, series; `force` scales to the fish's unit, `truth` is of a simulated fish only. */
-const CHARTS = [
-  {
-    key: "fx", title: ["Force F", "x"], force: true,
-    series: [line("fx", "fx", { width: 1 }), line("thrust", "thrust", { width: 2, name: "mean" }),
-      invisible("thrust_high"), invisible("thrust_low"), points("suspect_fx")],
-    bands: [{ series: [3, 4], fill: colour("band") }],
-  },
-  {
-    key: "thrust", title: ["Thrust, with its 95 % interval"], force: true, virtual: true,
-    series: [line("thrust", "thrust", { width: 2 }), invisible("thrust_high"), invisible("thrust_low")],
-    bands: [{ series: [2, 3], fill: colour("band") }],
-  },
-  { key: "fy", title: ["Force F", "y"], force: true, series: [line("fy", "fy"), points("suspect_fy")] },
-  {
-    key: "phi", title: ["Command φ", "c"], unit: "rad", limits: true, stepped: true,
-    series: [line("phi_c", "phi", { stepped: true, name: "command" }), line("phi", "alpha", { name: "wheel" })],
-  },
-  { key: "fin_velocity", title: ["Fin velocity, estimated"], unit: "", series: [line("fin_velocity", "fin")] },
-  { key: "alpha", title: ["Fin angle α, true"], unit: "rad", smallest: 0.1, truth: true, series: [line("alpha", "alpha")] },
-  { key: "speed", title: ["Speed, true"], unit: "m/s", truth: true, series: [line("speed", "fin")] },
-];
-
-/** Return a range around the values that does not follow each of their movements; smallestOf: returns its least width. */
-function steadyRange(smallestOf, limitsOf) {
-  let low = NaN, high = NaN;
-  return (chart, least, most) => {
-    const limits = limitsOf();
-    if (limits) return [limits[0] * 1.15, limits[1] * 1.15];
-    if (!Number.isFinite(least)) return Number.isFinite(low) ? [low, high] : [-1, 1];
-    const middle = 0.5 * (least + most);
-    const span = Math.max(most - least, smallestOf(), 1e-3 * Math.abs(most));
-    [least, most] = [middle - 0.5 * span, middle + 0.5 * span];
-    if (!(least >= low && most <= high && span > SHRINK * (high - low))) {
-      const step = 10 ** Math.floor(Math.log10(span)) / 2;
-      low = Math.floor((least - 0.08 * span) / step) * step;
-      high = Math.ceil((most + 0.08 * span) / step) * step;
-    }
-    return [low, high];
-  };
-}
-
-/** Return the number of decimals that a step such as 0.25 needs. */
-function decimalsOf(step) {
-  for (let decimals = 0; decimals < 9; decimals++) if (Math.abs(step - step.toFixed(decimals)) < 1e-6 * step) return decimals;
-  return 9;
-}
-
-class Chart {
-  constructor(parent, definition, owner) {
-    this.definition = definition;
-    this.owner = owner;
-    this.root = parent.appendChild(document.createElement("figure"));
-    this.root.className = "chart";
-    const caption = this.root.appendChild(document.createElement("figcaption"));
-    this.titleNode = caption.appendChild(document.createElement("span"));
-    this.keys = caption.appendChild(document.createElement("span"));
-    this.keys.className = "keys";
-    this.readout = caption.appendChild(document.createElement("output"));
-    this.plotNode = this.root.appendChild(document.createElement("div"));
-    this.plotNode.className = "plot";
-    this.visible = true;
-    this.factor = 1;
-    this.unit = definition.unit ?? "";
-    this.setTitle(definition.title);
-    for (const { name, stroke, column } of definition.series) if (name) this.#key(name, stroke, column);
-    this.data = [owner.times, ...definition.series.map(() => owner.newColumn())];
-    this.plot = new globalThis.uPlot(this.#options(), this.data, this.plotNode);
-    this.plot.setScale("x", { min: -owner.seconds, max: 0 });
-    this.size();
-  }
-
-  setTitle([text, index]) {
-    const unit = this.unit ? ` [${this.unit}]` : "";
-    const sub = document.createElement("sub");
-    sub.textContent = index ?? "";
-    this.titleNode.replaceChildren(text, ...(index ? [sub] : []), unit);
-    this.plotNode.setAttribute("role", "img");
-    this.plotNode.setAttribute("aria-label", `Chart of ${text}${index ? `_${index}` : ""}${unit}`);
-  }
-
-  setUnit(unit, factor = 1) {
-    if (unit === this.unit && factor === this.factor) return;
-    Object.assign(this, { unit, factor });
-    this.setTitle(this.definition.title);
-  }
-
-  show(visible) {
-    this.root.hidden = !visible;
-  }
-
-  size() {
-    const width = this.plotNode.clientWidth;
-    if (width > 0 && width !== this.plot.width) this.plot.setSize({ width, height: HEIGHT });
-  }
-
-  fill(ring) {
-    this.definition.series.forEach(({ column }, index) => ring.copy(column, this.data[index + 1], this.factor));
-  }
-
-  /** Show the keys of the lines that have values. */
-  showKeys(ring) {
-    for (const key of this.keys.children) key.hidden = !ring.has(key.dataset.column);
-  }
-
-  draw(low, high) {
-    this.plot.batch(() => {
-      this.plot.setData(this.data, false);
-      this.plot.setScale("x", { min: low, max: high });
-    });
-    this.read();
-  }
-
-  /** Write the values at the cursor, or the latest ones, beside the title. */
-  read() {
-    const index = this.plot.cursor.idx ?? this.data[0].length - 1;
-    const value = this.data[1][index];
-    const { min, max } = this.plot.scales.y;
-    this.readout.value = value == null ? "–" : number(value, Math.max(0, 2 - Math.floor(Math.log10(max - min))));
-  }
-
-  #key(name, stroke, column) {
-    const key = this.keys.appendChild(document.createElement("span"));
-    key.dataset.column = column;
-    key.textContent = name;
-    key.style.setProperty("--key", stroke());
-  }
-
-  #options() {
-    const { uPlot } = globalThis;
-    const font = "11px system-ui, sans-serif";
-    const axis = { stroke: colour("muted"), font, ticks: { show: false }, grid: { stroke: colour("grid"), width: 1 } };
-    const { definition, owner } = this;
-    return {
-      width: 300,
-      height: HEIGHT,
-      padding: [definition.labelled ? 15 : 6, 16, 0, 0],
-      pxAlign: 1,
-      legend: { show: false },
-      cursor: { sync: { key: "fish", setSeries: false }, drag: { x: false, y: false }, points: { size: 6 } },
-      scales: { x: { time: false, auto: false }, y: { range: steadyRange(() => this.factor * (definition.smallest ?? 1e-3), () => definition.limits && owner.limits) } },
-      axes: [
-        {
-          ...axis, size: 22, gap: 2,
-          splits: (plot, index, low, high) => owner.secondsBack().map((back) => high - back),
-          values: (plot, splits) => splits.map((x, index) => {
-            const back = Math.round(plot.scales.x.max - x);
-            return index === 0 ? "" : back ? `−${back} s` : "latest";
-          }),
-        },
-        {
-          ...axis, size: 50, gap: 4, space: 26,
-          values: (plot, splits, index, space, step) =>
-            splits.map((y) => number(y, decimalsOf(step))),
-        },
-      ],
-      series: [{}, ...definition.series.map(({ column, aside, stepped, name, ...series }) => ({
-        spanGaps: false,
-        points: { show: false },
-        ...series,
-        ...(stepped ? { paths: uPlot.paths.stepped({ align: 1 }) } : {}),
-      }))],
-      bands: definition.bands,
-      hooks: {
-        drawAxes: [(plot) => this.#drawBehind(plot)],
-        draw: [(plot) => this.#drawMarks(plot)],
-        setCursor: [() => this.read()],
-      },
-    };
-  }
-
-  /** Draw gaps as hatched areas, limits and the virtual result as dashed lines. */
-  #drawBehind(plot) {
-    const { ctx, bbox } = plot;
-    ctx.save();
-    ctx.beginPath();
-    ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-    ctx.clip();
-    ctx.fillStyle = palette.grid;
-    for (const [from, to] of this.owner.gaps) {
-      const left = plot.valToPos(from, "x", true), right = plot.valToPos(to, "x", true);
-      ctx.fillRect(left, bbox.top, Math.max(2, right - left), bbox.height);
-    }
-    const horizontal = (value, name) => {
-      const y = plot.valToPos(value, "y", true);
-      ctx.strokeStyle = palette[name];
-      ctx.beginPath();
-      ctx.moveTo(bbox.left, y);
-      ctx.lineTo(bbox.left + bbox.width, y);
-      ctx.stroke();
-    };
-    ctx.lineWidth = devicePixelRatio;
-    ctx.setLineDash([5 * devicePixelRatio, 4 * devicePixelRatio]);
-    const { limits, virtual } = this.owner;
-    if (this.definition.limits && limits) for (const limit of limits) horizontal(limit, "muted");
-    if (this.definition.virtual && virtual != null) horizontal(virtual * this.factor, "virtual");
-    ctx.restore();
-  }
-
-  /** Draw where a controller or parameters changed; the first chart names the tick. */
-  #drawMarks(plot) {
-    const { ctx, bbox } = plot;
-    const { min, max } = plot.scales.x;
-    ctx.save();
-    ctx.strokeStyle = ctx.fillStyle = palette.mark;
-    ctx.lineWidth = devicePixelRatio;
-    ctx.setLineDash([2 * devicePixelRatio, 2 * devicePixelRatio]);
-    ctx.font = `${10 * devicePixelRatio}px system-ui, sans-serif`;
-    ctx.textAlign = "left";
-    ctx.textBaseline = "alphabetic";
-    let free = -Infinity;
-    for (const mark of this.owner.marks) {
-      if (mark.time < min || mark.time > max) continue;
-      const x = plot.valToPos(mark.time, "x", true);
-      ctx.beginPath();
-      ctx.moveTo(x, bbox.top);
-      ctx.lineTo(x, bbox.top + bbox.height);
-      ctx.stroke();
-      const text = mark.seq === null ? mark.text : `#${mark.seq} ${mark.text}`;
-      const width = ctx.measureText(text).width + 8 * devicePixelRatio;
-      if (!this.definition.labelled) continue;
-      const left = Math.min(x, bbox.left + bbox.width - width);
-      if (left < free) continue;
-      ctx.fillText(text, left, bbox.top - 4 * devicePixelRatio);
-      free = left + width;
-    }
-    ctx.restore();
-  }
-}
-
-/** All charts of a fish over one common time. */
 export class Charts {
-  constructor(parent, seconds) {
+  /**
+   * parent: element of the charts
+   * changed: called when view, cursor or charts have changed; say: says a text to screen readers
+   */
+  constructor(parent, { changed, say }) {
+    Object.assign(this, { parent, changed, say, length: 2, marks: [], gaps: [], limits: null, virtual: null });
+    Object.assign(this, { all: [], namedCharts: [], names: "", cursor: null, first: null, drawn: 0, dirty: true });
     readPalette();
-    this.parent = parent;
-    this.seconds = seconds;
-    this.length = 2;
+    this.view = new View(recall("seconds", 15));
+    this.arrangement = new Arrangement();
     this.times = this.newColumn();
-    this.marks = [];
-    this.gaps = [];
-    this.limits = null;
-    this.virtual = null;
-    this.names = "";
-    this.charts = CHARTS.map((definition, index) => new Chart(parent, { ...definition, labelled: index === 0 }, this));
-    this.namedCharts = Array.from({ length: NAMED_CHARTS }, () => new Chart(parent, {
-      title: [""], series: [line("", "fin")],
-    }, this));
-    for (const chart of this.namedCharts) chart.show(false);
-    this.all = [...this.charts, ...this.namedCharts];
-    this.drawn = 0;
-    this.dirty = true;
-    new ResizeObserver(() => this.all.forEach((chart) => chart.size())).observe(parent);
-    const watch = new IntersectionObserver((entries) => {
+    this.motion = matchMedia("(prefers-reduced-motion: reduce)");
+    const { view } = this;
+    this.actions = {
+      pause: () => this.#move((newest) => view.toggle(newest)),
+      follow: () => this.#move((newest) => view.isLive || view.toggle(newest)),
+      pan: (fraction) => this.#move((newest) => view.pan(fraction, newest)),
+      zoom: (factor, fraction = 0.5) => this.#move((newest) => view.zoom(factor, fraction, newest)),
+      tap: (fraction) => this.#move((newest) => (this.cursor = view.span(newest)[0] + fraction * view.seconds)),
+      clear: () => this.setCursor(null),
+    };
+    this.watch = new IntersectionObserver((entries) => {
       for (const entry of entries) this.all.find(({ root }) => root === entry.target).visible = entry.isIntersecting;
-      this.dirty = true;
-    }, { rootMargin: "100px" });
-    this.all.forEach(({ root }) => watch.observe(root));
+      this.#changed();
+    });
+    this.charts = CHARTS.map((definition) => this.#add(definition));
+    this.arrange();
+    new ResizeObserver(() => this.all.forEach((chart) => chart.size())).observe(parent);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
       readPalette();
       this.dirty = true;
@@ -295,21 +54,20 @@ export class Charts {
 
   /** Use another ring, after a connection or a restart. */
   setRing(ring) {
-    this.ring = ring;
-    this.setSeconds(this.seconds);
+    Object.assign(this, { ring, cursor: null });
+    this.#changed();
   }
 
   setSeconds(seconds) {
-    this.seconds = seconds;
-    this.length = Math.min(this.ring.capacity, Math.ceil(seconds / this.ring.period) + 64);
-    this.times = this.newColumn();
-    for (const chart of this.all) chart.data = [this.times, ...chart.definition.series.map(() => this.newColumn())];
-    this.dirty = true;
+    remember("seconds", seconds);
+    this.view.zoom(seconds / this.view.seconds, 1, this.ring.latest?.time);
+    this.#changed();
   }
 
-  secondsBack() {
-    const step = this.seconds / (this.parent.clientWidth < 380 ? 3 : 5);
-    return Array.from({ length: Math.round(this.seconds / step) + 1 }, (_, index) => index * step).reverse();
+  /** Note that ticks have come; a view that stands still does not change, unless they are of a new fishd. */
+  advance() {
+    if (this.view.high - this.view.seconds > this.ring.latest.time) this.actions.follow();
+    this.dirty ||= this.view.isLive;
   }
 
   /** Fit units, limits, quantities of the controller and readings of sensors to the status. */
@@ -317,79 +75,143 @@ export class Charts {
     const [factor, unit] = forceUnit(status);
     for (const chart of this.charts) if (chart.definition.force) chart.setUnit(unit, factor);
     this.limits = status ? [status.lowest_angle, status.highest_angle] : null;
-    const named = [
-      ...(controller?.quantities ?? []).map(({ name, ...about }) => ({ ...about, column: QUANTITY + name, title: `${controller.name}: ${name}` })),
-      ...Object.entries(status?.readings ?? {}).map(([name, about]) => ({ ...about, column: READING + name, title: name })),
-    ];
-    const names = named.map(({ column }) => column).join();
+    const named = namedColumns(status, controller).slice(0, NAMED_CHARTS), names = named.map(({ column }) => column).join();
     if (names === this.names) return;
     this.names = names;
+    while (this.namedCharts.length < named.length) this.namedCharts.push(this.#add(namedChart()));
     this.namedCharts.forEach((chart, index) => {
-      const entry = named[index];
-      chart.known = entry !== undefined;
-      if (!entry) return chart.show(false);
-      chart.definition.title = [entry.title.replaceAll("_", " ")];
-      chart.definition.series[0].column = entry.column;
-      chart.unit = unitText(entry.unit);
-      chart.setTitle(chart.definition.title);
-      chart.root.title = entry.description;
+      chart.known = false;
+      chart.setColumn(named[index] ?? { title: [""] });
     });
-    this.dirty = true;
+    this.arrange();
   }
 
-  /** Note a change; its tick is looked up once. */
+  /** Charts that have values, in the order of this browser. */
+  get available() {
+    return this.arrangement.sort(this.all.filter(({ known }) => known));
+  }
+
+  /** Charts that are shown, in their order. */
+  get shown() {
+    return this.available.filter(({ root }) => !root.hidden);
+  }
+
+  /** Change the arrangement, and show the chosen charts in their order. */
+  arrange(change = () => {}) {
+    change();
+    for (const chart of this.all) chart.root.hidden = !chart.known || this.arrangement.hidden.includes(chart.key);
+    let before = null;
+    for (const { root } of this.available) {
+      if (root.previousElementSibling !== before) this.parent.insertBefore(root, before ? before.nextSibling : this.parent.firstChild);
+      before = root;
+    }
+    [this.first = null] = this.shown;
+    this.filled = "";
+    for (const chart of this.shown) chart.size();
+    this.#changed();
+  }
+
+  /** Note a change, or a mark at a tick of the past. */
   mark(time, text) {
-    this.marks.push({ time, text, seq: this.ring?.seqAt(time) ?? null });
-    if (this.marks.length > 64) this.marks.shift();
+    const [, words, seq] = MARK_AT.exec(text) ?? [];
+    this.marks.push(seq ? { time: NaN, text: words, seq: Number(seq) } : { time, text, seq: null });
+    if (this.marks.length > MAX_MARKS) this.marks.shift();
     this.dirty = true;
   }
 
-  /** Draw what is in view, if anything is new and the last drawing is old enough. */
-  draw(now) {
-    if (!this.ring || !this.dirty || now - this.drawn < FRAME_MS - 4) return;
-    this.drawn = now;
+  /** Show the values at a time in all charts; null: the latest ones. */
+  setCursor(time) {
+    this.cursor = time;
+    this.#changed();
+  }
+
+  /** Return unix time and number of the tick at the cursor, and its age [s]. */
+  get cursorTick() {
+    const { ring, cursor } = this;
+    return { t: ring.unixTime(cursor), seq: ring.seqAt(cursor), age: ring.latest.time - cursor };
+  }
+
+  /** Show the time at the pointer or the cursor; null: the end of a view that stands still. */
+  showTime(time) {
+    const at = time ?? this.view.high, { ring } = this, output = document.getElementById("chart-time");
+    const text = at === null || !ring.latest ? "" : `${timeOfDay(ring.unixTime(at))}, ${number(ring.latest.time - at, 2)} s ago`;
+    if (output && output.textContent !== text) output.textContent = text;
+  }
+
+  /** Carry out a key over a chart. */
+  press(event, chart) {
+    const step = (by) => {
+      const { ring } = this, [low, high] = this.view.span(ring.latest?.time), level = ring.level(low, high);
+      this.setCursor(Math.min(ring.latest.time, Math.max(level.oldest, (this.cursor ?? high) + by * level.period)));
+      this.draw(Infinity);
+      this.say(`${chart.text}: ${chart.readout.value}, ${number(this.cursorTick.age, 2)} s ago`);
+    };
+    if (this.ring.rows) pressKey(event, { ...this.actions, step });
+  }
+
+  /** Return how long the next drawing has to wait [ms]: a view of minutes moves slowly. */
+  waitMs(now) {
+    const pixelMs = (1000 * this.view.seconds) / (this.first?.plot.width ?? 300);
+    const pause = this.motion.matches ? REDUCED_FRAME_MS : Math.min(SLOW_FRAME_MS, Math.max(FRAME_MS, pixelMs));
+    return this.view.isLive ? Math.max(0, this.drawn + pause - 4 - now) : 0;
+  }
+
+  /** Draw what is in sight, or all charts, if anything is new and the last drawing is old enough. */
+  draw(now, isAll = false) {
+    const { ring, view } = this;
+    if (!ring?.rows || !(isAll || (this.dirty && this.waitMs(now) === 0))) return;
+    this.drawn = Math.min(now, performance.now());
     this.dirty = false;
-    const { ring } = this;
-    if (!ring.rows) return;
-    ring.copyTimes(this.times);
-    this.#findGaps();
-    const high = this.times[this.length - 1], low = high - this.seconds;
-    for (const mark of this.marks) if (mark.seq === null && mark.time >= low) mark.seq = ring.seqAt(mark.time);
-    for (const chart of this.charts) {
-      chart.showKeys(ring);
-      if (!chart.definition.truth) continue;
-      chart.known ||= ring.has(chart.definition.series[0].column);
-      chart.show(chart.known);
-      chart.size();
+    const isNew = ({ definition, known }) => !known && ring.has(definition.series[0].column);
+    if (this.all.some(isNew)) this.arrange(() => this.all.filter(isNew).forEach((chart) => (chart.known = true)));
+    const charts = this.shown.filter((chart) => isAll || !view.isLive || chart.visible || !chart.drawn);
+    if (!charts.length) return;
+    const [low, high] = view.span(ring.latest.time), filled = `${low} ${high}`;
+    const level = ring.level(low, high), skip = Math.max(0, level.newer(high) - 1);
+    if (filled !== this.filled) this.#take(level, skip);
+    for (const mark of this.marks) {
+      if (Number.isNaN(mark.time)) mark.time = ring.timeOf(mark.seq);
+      else if (mark.seq === null && mark.time >= low) mark.seq = ring.seqAt(mark.time);
     }
-    for (const chart of this.namedCharts) {
-      if (chart.known && chart.root.hidden && ring.has(chart.definition.series[0].column)) {
-        chart.show(true);
-        chart.size();
-      }
-    }
-    for (const chart of this.all) {
-      if ((chart.drawn && !chart.visible) || chart.root.hidden) continue;
+    for (const chart of charts) {
       chart.drawn = true;
-      chart.fill(ring);
+      if (filled !== this.filled) chart.fill(level, skip);
       chart.draw(low, high);
     }
+    this.filled = view.isLive ? "" : filled;
   }
 
   /** Draw the thrust of a simulated fish, which may be null, in the chart of the thrust [N]. */
   setVirtual(thrust) {
-    if (thrust === this.virtual) return;
+    this.dirty ||= thrust !== this.virtual;
     this.virtual = thrust;
-    this.dirty = true;
   }
 
-  #findGaps() {
-    this.gaps.length = 0;
-    const numbers = this.numbers?.length === this.length ? this.numbers : (this.numbers = this.newColumn());
-    this.ring.copy("seq", numbers);
-    const first = this.length - Math.min(this.ring.rows, this.length);
-    for (let i = Math.max(first, 1); i < this.length - 1; i++) {
-      if (numbers[i] === null && i > first) this.gaps.push([this.times[i - 1], this.times[i + 1]]);
-    }
+  #add(definition) {
+    const chart = new Chart(this.parent, definition, this);
+    this.all.push(chart);
+    this.watch.observe(chart.root);
+    return chart;
+  }
+
+  #move(change) {
+    if (!this.ring.rows) return;
+    change(this.ring.latest.time);
+    this.#changed();
+  }
+
+  #changed() {
+    this.dirty = true;
+    this.changed();
+  }
+
+  /** Take times and gaps of the view from the ticks or the bins. */
+  #take(level, skip) {
+    this.length = Math.min(level.capacity, Math.ceil(this.view.seconds / level.period) + 64);
+    if (this.length !== this.times.length) [this.times, this.numbers] = [this.newColumn(), this.newColumn()];
+    const { times, numbers, length } = this;
+    level.copyTimes(times, skip);
+    level.copy("seq", numbers, 1, skip);
+    this.gaps = numbers.flatMap((seq, i) => (seq === null && i > length - level.rows + skip && i > 0 && i < length - 1 ? [[times[i - 1], times[i + 1]]] : []));
   }
 }

@@ -74,6 +74,9 @@ export function controllerText(name, parameters) {
   return values ? `${name}:${values}` : name;
 }
 
+/** Quote a word as a shell needs it. */
+export const quote = (word) => (/^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`);
+
 /** An answer of the server that is not the result. */
 export class Refusal extends Error {
   constructor({ code, message, remedy }, status) {

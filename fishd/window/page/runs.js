@@ -1,90 +1,120 @@
-// The kept runs: a table, and what is known of one, with its picture.
-import { call, controllerText, duration, fetchPicture, forceUnit, html, interval, sentence, useEffect, useState } from "./common.js";
-import { halfWidthOf, selectionWithOwn, startJob } from "./experiments.js";
+// The kept runs: a table that is filtered and sorted, the comparison of some, and the trash.
+import { call, duration, forceUnit, html, interval, sentence, useEffect, useState } from "./common.js";
+import { halfWidthOf } from "./experiments.js";
+import { Comparison } from "./results.js";
+import { idOf, isInProgress, Run } from "./run.js";
+import { Trash } from "./trash.js";
 
-const MAX_RUNS = 40;
-/** Kinds of experiments that the server resumes. */
-const RESUMABLE = ["measure", "sweep", "compare"];
+/** Number of runs that are shown at first, and by which more are shown. */
+const PAGE_RUNS = 40;
+const MAX_COMPARED = 12;
+/** Number of days back from now to the begin of a run, by title. */
+const AGES = { "any time": Infinity, "last day": 1, "last week": 7, "last month": 31, "last year": 366 };
 const shortDate = new Intl.DateTimeFormat([], { month: "short", day: "numeric", hour: "2-digit", minute: "2-digit", hourCycle: "h23" });
+
+const beginOf = (run) => run.began ?? run.about?.started ?? "";
+const numberOf = (run) => Number(run.number ?? run.about?.number ?? 0);
+const fishOf = (run) => run.about?.subject ?? "";
+const timeOf = (run) => Date.parse(beginOf(run)) || 0;
+const compareTexts = (get) => (a, b) => get(a).localeCompare(get(b), undefined, { numeric: true });
+
+/** Return the names of the controllers of a run. */
+const controllersOf = (run, known) => (run.kind === "recording" ? Object.keys(run.swim_ticks ?? {})
+  : [...new Set((run.command ?? []).map((word) => word.split(":")[0]))].filter((word) => known.includes(word)));
+
+/** Return what a run is, in a few words. */
+const whatOf = (run) => (run.kind === "recording" ? Object.keys(run.swim_ticks ?? {}).join(", ") || "at rest" : run.kind);
+
+const ORDERS = {
+  "newest first": (a, b) => timeOf(b) - timeOf(a) || numberOf(b) - numberOf(a),
+  "oldest first": (a, b) => timeOf(a) - timeOf(b) || numberOf(a) - numberOf(b),
+  name: compareTexts((run) => run.name),
+  what: compareTexts(whatOf),
+  fish: compareTexts(fishOf),
+  "longest first": (a, b) => (b.duration ?? -1) - (a.duration ?? -1),
+  "most thrust first": (a, b) => (b.thrust ?? -Infinity) - (a.thrust ?? -Infinity),
+};
+
+/** Return whether a run has all words of a text in its name, its kind, or what is noted of it, or as its date. */
+function hasWords(run, text) {
+  const { subject, note, operator } = run.about ?? {};
+  const known = [run.name, whatOf(run), subject, note, operator, ...(run.command ?? [])].join(" ").toLowerCase();
+  return text.toLowerCase().split(/\s+/).every((word) => known.includes(word)
+    || (word.length >= 4 && beginOf(run).startsWith(word)));
+}
 
 export function Runs(page) {
   const { state } = page;
-  const [runs, setRuns] = useState(null);
-  const [failure, setFailure] = useState(null);
-  const [open, setOpen] = useState(null);
+  const [runs, setRuns] = useState(null), [failure, setFailure] = useState(null);
+  const [open, setOpen] = useState(null), [count, setCount] = useState(PAGE_RUNS);
+  const [filter, setFilter] = useState({ text: "", controller: "", age: "any time", order: "newest first" });
+  const [picked, setPicked] = useState([]), [compared, setCompared] = useState(null), [changes, setChanges] = useState(0);
   const finished = [...state.jobs.values()].filter(({ state: at }) => at !== "running").length;
   const load = () => call("GET", "/api/runs").then((found) => {
     setRuns(found);
+    setPicked((before) => before.filter((id) => found.some((run) => idOf(run) === id)));
     setFailure(null);
   }).catch(setFailure);
   useEffect(() => {
     if (state.session?.paired) load();
-  }, [finished, state.session?.paired]);
-  const begin = (run) => run.began ?? run.about?.started ?? "";
-  const order = (run) => Number(run.number ?? run.about?.number ?? 0);
-  const list = (runs ?? []).slice().sort((a, b) => order(b) - order(a)).slice(0, MAX_RUNS);
+  }, [finished, changes, state.session?.paired]);
+  const known = state.controllers.map(({ name }) => name);
+  const controllers = [...new Set((runs ?? []).flatMap((run) => controllersOf(run, known)))].sort();
+  const set = (name) => (event) => {
+    setFilter({ ...filter, [name]: event.target.value });
+    setCount(PAGE_RUNS);
+  };
+  const choose = (title, name, values) => html`<label>${title} <select value=${filter[name]} onChange=${set(name)}>
+    ${Object.keys(values).map((value) => html`<option value=${value}>${value}</option>`)}</select></label>`;
+  const shown = (runs ?? []).filter((run) => hasWords(run, filter.text.trim())
+    && (!filter.controller || controllersOf(run, known).includes(filter.controller))
+    && timeOf(run) >= Date.now() - 86_400_000 * AGES[filter.age]).sort(ORDERS[filter.order]);
+  const pick = (id) => () => setPicked(picked.includes(id) ? picked.filter((other) => other !== id) : [...picked, id]);
+  const changed = () => setChanges((n) => n + 1);
+  const hasFish = (runs ?? []).some(fishOf);
   return html`
-    <div class="head-row"><h2 id="runs-title">Runs</h2><button type="button" onClick=${load}>Refresh</button></div>
+    <div class="head-row"><h2 id="runs-title">Runs</h2><span class="muted" role="status">${runs
+      && (shown.length === runs.length ? `${runs.length}` : `${shown.length} of ${runs.length}`)}</span>
+      <button type="button" onClick=${changed}>Refresh</button></div>
+    ${runs?.length > 0 && html`<div class="filter">
+      <label>Find <input type="search" placeholder="name, fish, note, date" value=${filter.text} onInput=${set("text")} /></label>
+      <label>Controller <select value=${filter.controller} onChange=${set("controller")}><option value="">any</option>
+        ${controllers.map((name) => html`<option value=${name}>${name}</option>`)}</select></label>
+      ${choose("Began", "age", AGES)}${choose("Sort by", "order", ORDERS)}
+      ${picked.length > 0 && html`<span class="buttons"><button type="button" class="primary" disabled=${picked.length < 2 || picked.length > MAX_COMPARED}
+        onClick=${() => setCompared(picked)}>Compare ${picked.length}</button>
+        <button type="button" onClick=${() => setPicked([])}>Pick none</button>
+        <span class="muted">${picked.length < 2 ? "Pick another one." : picked.length > MAX_COMPARED && `At most ${MAX_COMPARED}.`}</span></span>`}
+    </div>`}
+    ${compared && html`<${Comparison} key=${compared.join()} runs=${compared} close=${() => setCompared(null)} />`}
     ${failure && html`<p class="note">The runs cannot be listed. ${sentence(failure.message)} ${sentence(failure.remedy)}</p>`}
-    ${runs === null ? !failure && html`<p class="muted">Loading …</p>` : list.length === 0
+    ${runs === null ? !failure && html`<p class="muted">Loading …</p>` : runs.length === 0
       ? html`<p class="muted complete">None yet. Record, measure or sweep, and it is listed here.</p>`
-      : html`<div class="scroll complete" tabindex="0" role="region" aria-label="Table of runs"><table>
-        <thead><tr><th>name</th><th>what</th><th>began</th><th class="right">length</th><th class="right">thrust</th>
-          <th class="right">lost ticks</th><th><span class="unseen">what to do</span></th></tr></thead>
-        <tbody>${list.map((run) => {
-          const [factor, unit] = forceUnit(run);
-          const half = halfWidthOf(run);
-          const [middle, error] = run.thrust == null ? ["", ""] : interval(run.thrust * factor, half == null ? NaN : half * factor);
-          return html`<tr key=${run.name} class=${run.kind === "recording" && run.problem ? "damaged" : ""}>
-            <td>${run.name}
-              ${["running", "recording", "unfinished"].includes(run.state) && html` <span class="pill small">${run.state}</span>`}
-              ${run.problem && html`<br /><small>${run.problem}</small>`}</td><td>${run.kind === "recording" ? Object.keys(run.swim_ticks ?? {}).join(", ") || "at rest" : run.kind}</td><td>${begin(run) && shortDate.format(new Date(begin(run)))}</td>
-            <td class="right">${run.duration !== undefined ? duration(run.duration) : run.kind === "sweep" && run.rows ? `${run.rows} points` : ""}</td>
-            <td class="right">${middle} ${error} ${run.thrust == null ? "" : unit}</td>
-            <td class="right">${run.lost_ticks ?? ""}</td>
-            <td class="actions">
-              <button type="button" aria-expanded=${open === run.name} aria-label=${`${open === run.name ? "Close" : "Open"} ${run.name}`}
-                onClick=${() => setOpen(open === run.name ? null : run.name)}>${open === run.name ? "Close" : "Open"}</button>
-            </td></tr>
-            ${open === run.name && html`<tr class="plot-row"><td colspan="7"><${Run} key=${run.name} run=${run} page=${page} /></td></tr>`}`;
-        })}</tbody></table></div>`}`;
+      : html`<div class="scroll complete" tabindex="0" role="region" aria-label="Table of runs"><table class=${`runs ${hasFish ? "" : "no-fish"}`}>
+        <thead><tr><th><span class="unseen">compare</span></th><th>name</th><th>what</th><th class="fish">fish</th><th>began</th>
+          <th class="right">length</th><th class="right">thrust</th><th class="right lost">lost ticks</th><th><span class="unseen">what to do</span></th></tr></thead>
+        <tbody>${shown.slice(0, count).map((run) => {
+          const id = idOf(run), isOpen = open === id;
+          return html`<${Line} key=${id} run=${run} isOpen=${isOpen} isPicked=${picked.includes(id)} pick=${pick(id)}
+              toggle=${() => setOpen(isOpen ? null : id)} />
+            ${isOpen && html`<tr key=${`${id}/`} class="plot-row"><td colspan="9"><${Run} run=${run} page=${page} changed=${changed}
+              open=${setOpen} /></td></tr>`}`;
+        })}</tbody></table></div>`}
+    ${shown.length > count && html`<button type="button" onClick=${() => setCount(count + PAGE_RUNS)}>Show ${Math.min(PAGE_RUNS, shown.length - count)} more</button>`}
+    <${Trash} page=${page} changes=${changes} changed=${changed} />`;
 }
 
-/** What is known of a run, what can be done with it, and its picture. */
-function Run({ run, page }) {
-  const { state } = page;
-  const { controller, own } = selectionWithOwn(state);
-  const mayDrive = state.session?.scope === "drive";
-  const { subject, note, operator } = run.about ?? {};
-  const about = [run.summary, subject, note, operator && `by ${operator}`].filter(Boolean).join("; ");
-  const rerun = (options) => () => startJob(page, "rerun", { run: run.name, ...options });
-  const resumable = run.state === "unfinished" && run.on === "live" && RESUMABLE.includes(run.kind);
-  return html`
-    ${about && html`<p>${about}</p>`}
-    ${run.command?.length > 0 && html`<p><code>${["fishctl", run.kind, ...run.command].join(" ")}</code></p>`}
-    <p class="muted">${run.path}</p>
-    ${run.kind === "recording" && html`<div class="buttons">
-      <button type="button" disabled=${!mayDrive} onClick=${rerun({})}>Rerun as recorded</button>
-      ${controller && html`<button type="button" disabled=${!mayDrive} onClick=${rerun({ controller: controller.name, parameters: own })}>
-        Rerun with ${controllerText(controller.name, own)}</button>`}
-      <span class="muted">Runs a controller again on the recorded forces, and compares its commands. The fish rests.</span></div>`}
-    ${resumable && html`<div class="buttons"><button type="button" class="primary" disabled=${!mayDrive}
-      onClick=${() => startJob(page, "resume", { run: run.name })}>Resume</button>
-      <span class="muted">It ended before it was complete; nothing is measured again.</span></div>`}
-    ${run.state !== "running" && html`<${Plot} name=${run.name} />`}`;
-}
-
-function Plot({ name }) {
-  const [picture, setPicture] = useState(null);
-  const [failure, setFailure] = useState("");
-  useEffect(() => {
-    let address = null;
-    fetchPicture(`/api/runs/${encodeURIComponent(name)}/plot.png`).then((blob) => {
-      address = URL.createObjectURL(blob);
-      setPicture(address);
-    }, (error) => setFailure(error.message));
-    return () => address && URL.revokeObjectURL(address);
-  }, []);
-  if (failure) return html`<p class="note">${sentence(failure)}</p>`;
-  return picture ? html`<img alt=${`Plot of ${name}`} src=${picture} />` : html`<p class="muted">It is being drawn …</p>`;
+function Line({ run, isOpen, isPicked, pick, toggle }) {
+  const [factor, unit] = forceUnit(run), half = halfWidthOf(run), begin = beginOf(run);
+  const [middle, error] = run.thrust == null ? ["", ""] : interval(run.thrust * factor, half == null ? NaN : half * factor);
+  return html`<tr class=${run.problem ? "damaged" : ""}>
+    <td class="pick"><input type="checkbox" checked=${isPicked} aria-label=${`Compare ${run.name}`} onChange=${pick} /></td>
+    <td class="name">${run.name}${(isInProgress(run) || run.state === "unfinished") && html` <span class="pill small">${run.state}</span>`}
+      ${run.about?.note && html`<br /><small>${run.about.note}</small>`}${run.problem && html`<br /><small>${run.problem}</small>`}</td>
+    <td class="what">${whatOf(run)}</td><td class="fish">${fishOf(run)}</td><td class="began">${begin && shortDate.format(new Date(begin))}</td>
+    <td class="length right">${run.duration == null ? "" : duration(run.duration)}${run.kind === "sweep" && run.rows ? ` ${run.rows} points` : ""}</td>
+    <td class="thrust right">${middle} ${error} ${run.thrust == null ? "" : unit}</td>
+    <td class="lost right">${run.lost_ticks ?? ""}</td>
+    <td class="actions"><button type="button" aria-expanded=${isOpen} aria-label=${`${isOpen ? "Close" : "Open"} ${run.name}`}
+      onClick=${toggle}>${isOpen ? "Close" : "Open"}</button></td></tr>`;
 }

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas
 import pytest
 from msgspec import UNSET
 from rigs.camera_process import CameraProcess, running_camera
@@ -172,6 +173,26 @@ def test_an_experiment_measures_the_largest_fin_angle(
     truth = simulate(load(), "square", {"frequency": 1.0, "amplitude": 0.3}).fin_amplitude
     assert result["fin_angle_max"] == pytest.approx(truth, rel=0.02)
     assert 0.0 < result["fin_angle_max_ci95"] < 0.01
+
+
+def test_each_point_of_a_sweep_has_the_largest_fin_angle(
+    daemon: Daemon, camera: CameraProcess, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    swim(daemon, "hold")
+    monkeypatch.setenv("FISHD_CAMERA", camera.endpoint)
+    waves = ("--frequency", "1,1.4", "--amplitude", "0.3")  # swings within the learned one
+    target = folder / "sweep"
+    words = ("--on", "live", "--for", "21", "--folder", str(target), "--tail")
+    done = fishctl("--endpoint", daemon.endpoint, "sweep", "square", *waves, *words)
+    assert done.returncode == 0, done.stderr
+    table = pandas.read_csv(target / "rows.csv")
+    assert list(table["parameters.frequency"]) == [1.0, 1.4]
+    known = table.dropna(subset="fin_angle_max")  # a busy machine may lose too many pictures
+    assert len(known) or "fin angles are unknown" in done.stderr
+    for _, row in known.iterrows():
+        wave = {"frequency": row["parameters.frequency"], "amplitude": 0.3}
+        truth = simulate(load(), "square", wave).fin_amplitude
+        assert row["fin_angle_max"] == pytest.approx(truth, rel=0.02)
 
 
 def test_an_experiment_without_a_camera_is_refused_before_the_fish_swims(

@@ -31,10 +31,15 @@ CHANGES = [
     ("/api/fish/fish/release", {}),
     ("/api/fish/fish/request", {"op": "set-controller", "args": {"name": "square"}}),
     ("/api/fish/fish/doctor", {}),
+    ("/api/fish/fish/queue", {"op": "clear"}),
     ("/api/jobs", {"fish": "fish", "kind": "record"}),
     ("/api/jobs/check", {"fish": "fish", "kind": "record"}),
     ("/api/jobs/1/stop", {}),
     ("/api/jobs/1/dismiss", {}),
+    ("/api/runs/x/note", {"note": "x"}),
+    ("/api/runs/x/rename", {"name": "y"}),
+    ("/api/runs/x/delete", {}),
+    ("/api/trash/20260101-000000/restore", {}),
 ]
 
 
@@ -49,7 +54,8 @@ async def test_no_name_that_leads_here_but_is_not_ours_gets_anything(
             "Host": authority, "Origin": f"http://{authority}",
             "X-Client": page.hello["client"],
         }  # fmt: skip
-        for path in ("/", "/api/session", "/api/fish", "/api/fish/fish/about/log", "/metrics"):
+        about = "/api/fish/fish/about/log"
+        for path in ("/", "/api/session", "/api/fish", about, "/api/forms", "/metrics"):
             async with browser.session.get(path, headers=headers) as response:
                 assert response.status == 403
         for path, body in CHANGES:
@@ -96,7 +102,11 @@ async def test_another_site_starts_no_reading_either_where_the_browser_tells(
     async with Browser(window.url) as browser:
         for site in ("cross-site", "same-site"):
             headers = {"Sec-Fetch-Site": site}
-            for path in ("/api/runs", "/api/fish/fish/about/log", "/camera", "/metrics"):
+            for path in (
+                *("/api/runs", "/api/trash", "/api/results?run=x", "/api/runs/x/download/all.zip"),
+                *("/api/fish/fish/queue", "/api/fish/fish/about/log", "/api/forms", "/metrics"),
+                "/camera",
+            ):
                 refused = await browser.refusal(path, headers=headers)
                 assert refused == (403, "other-origin")
 

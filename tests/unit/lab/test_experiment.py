@@ -153,7 +153,11 @@ def test_a_signal_rests_the_fish_and_keeps_what_was_measured(
     assert (folder / "rows.csv").read_text().count("\n") == 3
     (listed,) = json.loads(fishctl("runs", "--folder", str(tmp_path), "--json").stdout)
     assert (listed["state"], listed["rows"]) == ("unfinished", 2)
-    assert listed["thrust"] > 0.0
+    answer = folder / "result.json"
+    assert listed["thrust"] == json.loads(answer.read_bytes())["thrust"]
+    answer.unlink()
+    (listed,) = json.loads(fishctl("runs", "--folder", str(tmp_path), "--json").stdout)
+    assert listed["thrust"] is None, "not the luckiest of the candidates"
 
 
 def test_an_experiment_is_resumed_by_its_own_verb_with_its_own_options(tmp_path: Path) -> None:
@@ -183,7 +187,7 @@ def test_a_measurement_keeps_header_recording_and_result_and_is_listed(tmp_path:
     assert (listed["name"], listed["kind"], listed["on"]) == ("first", "measure", "simulation")
     for key in ("thrust", "thrust_ci95", "total_ci95"):
         assert listed[key] == result[key]
-    assert listed["state"] == "finished"
+    assert (listed["state"], listed["duration"]) == ("finished", result["seconds"])
     printed = fishctl("runs", "--folder", str(tmp_path)).stdout
     assert f"{1e3 * result['thrust']:.2f} ± {1e3 * result['total_ci95']:.2f}" in printed
     (folder / "experiment.json").write_text("{}")

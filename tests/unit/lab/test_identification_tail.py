@@ -1,6 +1,7 @@
 """Identification of a fish from its forces and the fin angle that a camera measured."""
 
 from collections.abc import Callable
+from dataclasses import replace as replaced
 from pathlib import Path
 
 import msgspec
@@ -15,6 +16,7 @@ from fishd.config import load
 from fishd.core.tail_reading import RecordedTail
 from fishd.lab.fin_angle import FinAngles
 from fishd.lab.identification import Identification, Unidentifiable, experiment, identify
+from fishd.lab.identification.figure import draw
 from fishd.lab.session import VirtualSession
 from fishd.recording import Run, open_run
 
@@ -107,6 +109,19 @@ def test_the_fin_angles_at_the_ticks_of_a_table_do_too(run: Run) -> None:
     assert identification["coupling"].value == pytest.approx(0.4, rel=0.01)
     half_width = 0.5 * (identification["coupling"].ci95_high - identification["coupling"].ci95_low)
     assert half_width == pytest.approx(0.05 * 0.4, rel=0.1)
+
+
+def test_the_figure_has_a_row_for_the_fin_angle(
+    identification: Identification, tmp_path: Path
+) -> None:
+    draw(identification, tmp_path / "tail.svg")
+    draw(replaced(identification, fin_angle=None), tmp_path / "forces.svg")
+    texts = [(tmp_path / name).read_text() for name in ("tail.svg", "forces.svg")]
+    assert [text.count("residual (mrad)") for text in texts] == [1, 0]
+    fit = identification.fin_angle
+    assert fit is not None
+    assert fit.measured == pytest.approx(fit.simulated, abs=0.01)
+    assert len(fit.times) == fit.used + fit.left_out
 
 
 def test_a_mirrored_picture_is_reported_and_counts(

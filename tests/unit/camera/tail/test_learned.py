@@ -36,9 +36,9 @@ def test_a_foreign_file_is_refused(file: Path) -> None:
 
 
 def test_a_file_of_another_version_is_refused(file: Path) -> None:
-    file.write_bytes(file.read_bytes().replace(b"tail 1\n", b"tail 2\n", 1))
+    file.write_bytes(file.read_bytes().replace(b"tail 2\n", b"tail 3\n", 1))
     with pytest.raises(
-        CannotUse, match=r"another version of fishd \(format 2, here 1\): learn again"
+        CannotUse, match=r"another version of fishd \(format 3, here 2\): learn again"
     ):
         Learned.load(file)
 

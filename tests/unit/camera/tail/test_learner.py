@@ -28,6 +28,13 @@ def test_a_light_tail_is_known() -> None:
     assert learn(replace(SMALL, water=60, tail=170)).is_light
 
 
+@pytest.mark.parametrize("film", [CASES["plain"], CASES["faint"]], ids=["plain", "faint"])
+def test_a_small_swing_which_never_uncovers_the_axis_is_learned(film: Film) -> None:
+    learned = learn(replace(film, motion=rest_before(1.0, sine(0.04))))
+    assert not learned.is_light
+    assert learned.span == pytest.approx((-0.04, 0.04), abs=4e-3)
+
+
 def test_without_a_rest_the_zero_is_the_middle_of_the_swing_and_less_well_known() -> None:
     learned = learn(replace(SMALL, motion=sine()))
     assert learned.zero_ci95 == 0.02

@@ -1,0 +1,242 @@
+"""Stored runs: their names and notes, the trash in which they stay for 30 days, and zip files."""
+
+import errno
+import os
+import re
+import shutil
+import stat
+import time
+import zipfile
+from calendar import timegm
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+from msgspec import Struct
+
+from fishd.core import files, text
+from fishd.core.errors import RecordingError
+from fishd.core.process.lockfile import find_lock_holder
+from fishd.recording.folder import EXPERIMENT, run_name
+from fishd.recording.notes import MAX_NOTE_CHARACTERS, note_path
+from fishd.recording.part_file import PART_SUFFIX, SUFFIX, is_being_written, rename_to_final
+
+TRASH = ".trash"
+"""Folder of deleted runs, in the folder of runs; each is in a folder named after its time."""
+KEPT_DAYS = 30
+"""Time for which a deleted run stays in the trash [days]."""
+PACKED_SUFFIXES = (SUFFIX, ".png", ".parquet", ".onnx", ".zip")
+"""Endings of files that are compressed already."""
+_NAME = re.compile(r"(?!.*\.part$)\w[\w. -]{0,99}")
+_ID, _ID_FORMAT = re.compile(r"\d{8}-\d{6}(-\d+)?", re.A), "%Y%m%d-%H%M%S"
+_READ_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+
+
+class DeletedRun(Struct):
+    """A run in the trash."""
+
+    id: str
+    """Name of its folder there: UTC date and time of the deletion."""
+    name: str
+    deleted: float
+    """Time of the deletion [s, unix]."""
+    path: str
+
+
+def find_stored_run(run: str, folder: Path) -> Path:
+    """Return the folder of an experiment, or the file of a recording; raise `RecordingError`.
+
+    run: its name, or the name of its file or folder, but no path
+    """
+    if "/" in run or run.startswith(".") or not run.isprintable():
+        raise RecordingError(f"'{text.quoted(run)}' is not the name of a run in {folder}")
+    for name in (run, run + SUFFIX, run + SUFFIX + PART_SUFFIX):
+        try:
+            mode = (folder / name).lstat().st_mode
+        except OSError:
+            continue
+        if stat.S_ISLNK(mode):
+            raise RecordingError(f"{folder / name} is a symbolic link; change what it leads to")
+        is_recording = name.endswith((SUFFIX, SUFFIX + PART_SUFFIX)) and stat.S_ISREG(mode)
+        if is_recording or (folder / name / EXPERIMENT).is_file():
+            return folder / name
+    raise RecordingError(f"no run is named '{text.quoted(run)}' in {folder}; see 'fishctl runs'")
+
+
+def set_note(path: Path, note: str) -> None:
+    """Replace the note of a run; raise `RecordingError`. The recording itself stays unchanged."""
+    if len(note) > MAX_NOTE_CHARACTERS or not note.isprintable():
+        raise RecordingError(f"a note is one line of at most {MAX_NOTE_CHARACTERS} characters")
+    with _os_errors(note_path(path), "cannot be written"):
+        files.write_atomically(note_path(path), f"{note}\n")
+
+
+def rename_run(path: Path, name: str) -> Path:
+    """Rename a run, never onto another one; return its new path; raise `RecordingError`."""
+    name, old = name.removesuffix(SUFFIX), _name_of(path)
+    if not _NAME.fullmatch(name):
+        raise RecordingError(
+            f"'{text.quoted(name)}' cannot be a name: letters, digits, '_', '-', '.' and spaces, "
+            "at most 100, the first one a letter, a digit or '_'"
+        )
+    _refuse_in_progress(path)
+    target = path.with_name(name + path.name.removeprefix(old))
+    _refuse_taken(path.parent, name)
+    _move(path, target)
+    return target
+
+
+def delete_run(path: Path) -> DeletedRun:
+    """Move a run into the trash, and remove older ones from it; raise `RecordingError`."""
+    _refuse_in_progress(path)
+    trash = path.parent / TRASH
+    with _os_errors(trash, "cannot take it; 'fishctl runs trash --empty' makes room"):
+        trash.mkdir(exist_ok=True)
+        if trash.is_symlink():
+            raise OSError(errno.ELOOP, "it is a symbolic link", str(trash))
+        place = files.unused_path(trash, time.strftime(_ID_FORMAT, time.gmtime()), "")
+        place.mkdir()
+    try:
+        _move(path, place / path.name)
+    except RecordingError:
+        place.rmdir()
+        raise
+    with suppress(RecordingError):
+        empty_trash(path.parent, KEPT_DAYS)
+    return DeletedRun(place.name, _name_of(path), _deletion_time(place), str(place / path.name))
+
+
+def list_trash(folder: Path) -> list[DeletedRun]:
+    """Return the deleted runs of a folder, the latest first; raise `RecordingError`."""
+    deleted = []
+    for place in sorted(_list_places(folder), reverse=True):
+        with _os_errors(place, "cannot be read"):
+            paths = sorted(place.iterdir())
+        for path in paths:
+            if path not in map(note_path, paths):
+                time_s = _deletion_time(place)
+                deleted.append(DeletedRun(place.name, _name_of(path), time_s, str(path)))
+    return deleted
+
+
+def restore_run(deleted_id: str, folder: Path) -> Path:
+    """Move a run back from the trash; return its path; raise `RecordingError`."""
+    for deleted in list_trash(folder):
+        if deleted_id in (deleted.id, deleted.name):  # the latest of several of one name
+            _refuse_taken(folder, deleted.name, "rename that one first")
+            path = Path(deleted.path)
+            _move(path, folder / path.name)
+            with suppress(OSError):
+                path.parent.rmdir()
+            return folder / path.name
+    raise RecordingError(f"the trash has no '{text.quoted(deleted_id)}'; see 'fishctl runs trash'")
+
+
+def empty_trash(folder: Path, days: float = 0.0) -> int:
+    """Remove what has been in the trash for longer than this time; return the number of runs."""
+    places = [p for p in _list_places(folder) if time.time() - _deletion_time(p) >= days * 86400]
+    for place in places:
+        with _os_errors(place, "cannot be removed"):
+            shutil.rmtree(place)
+    return len(places)
+
+
+def pack_run(path: Path, stream: IO[bytes]) -> None:
+    """Write the files of a run as a zip file into a stream, with little memory; raise OSError.
+
+    Links, pipes and locks are left out.
+    """
+    name = _name_of(path)
+    with zipfile.ZipFile(stream, "w", strict_timestamps=False) as archive:
+        if not path.is_dir():
+            folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+            try:
+                for file in (path.name, note_path(path).name):
+                    _pack_file(archive, file, folder, name)
+            finally:
+                os.close(folder)
+            return
+        for root, _, names, folder in os.fwalk(path):
+            for file in sorted(names):
+                _pack_file(archive, file, folder, str(name / Path(root).relative_to(path)))
+
+
+def _pack_file(archive: zipfile.ZipFile, name: str, folder: int, place: str) -> None:
+    """Add a file to an archive, unless it is none.
+
+    folder: descriptor of its folder; place: path of that folder in the archive
+    """
+    try:
+        descriptor = os.open(name, _READ_FLAGS, dir_fd=folder)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO, errno.ENOENT):  # a link, a socket, or removed
+            return
+        raise
+    with os.fdopen(descriptor, "rb") as file:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode) or name.endswith(".lock"):
+            return
+        date = max(time.localtime(status.st_mtime)[:6], (1980, 1, 1, 0, 0, 0))
+        entry = zipfile.ZipInfo(f"{place}/{name}", date)
+        if not name.endswith(PACKED_SUFFIXES):
+            entry.compress_type = zipfile.ZIP_DEFLATED
+        with archive.open(entry, "w", force_zip64=True) as packed:
+            shutil.copyfileobj(file, packed)
+
+
+def _name_of(path: Path) -> str:
+    return path.name if path.is_dir() else run_name(path)
+
+
+def _refuse_in_progress(path: Path) -> None:
+    """Raise `RecordingError` if a process records or measures it."""
+    locks = [lock.with_suffix("") for lock in path.glob("*.lock")] if path.is_dir() else []
+    parts = [*path.glob(f"*{PART_SUFFIX}")] if path.is_dir() else [path]
+    if any(map(find_lock_holder, locks)) or any(map(is_being_written, parts)):
+        raise RecordingError(f"{_name_of(path)} is in progress; stop it, or wait for its end")
+
+
+def _refuse_taken(folder: Path, name: str, remedy: str = "choose another name") -> None:
+    for suffix in ("", SUFFIX, SUFFIX + PART_SUFFIX):
+        if os.path.lexists(folder / f"{name}{suffix}"):
+            raise RecordingError(f"{folder / f'{name}{suffix}'} exists already; {remedy}")
+
+
+def _move(path: Path, target: Path) -> None:
+    """Move a run with its note; raise `RecordingError`, and then change nothing."""
+    note, new_note = note_path(path), note_path(target)
+    with _os_errors(path, "cannot be moved"):
+        if path.is_dir():
+            path.rename(target)
+            return
+        rename_to_final(path, target)
+    with _os_errors(note, "cannot be moved"), suppress(FileNotFoundError):
+        note.rename(new_note)
+
+
+def _list_places(folder: Path) -> Iterator[Path]:
+    """Yield the folder of each deleted run."""
+    trash = folder / TRASH
+    with _os_errors(trash, "cannot be read"), suppress(FileNotFoundError):
+        if not trash.is_symlink():
+            yield from (path for path in trash.iterdir() if _ID.fullmatch(path.name))
+
+
+def _deletion_time(place: Path) -> float:
+    """Return the time in the name of the folder of a deleted run [s, unix]."""
+    try:
+        return timegm(time.strptime(place.name[:15], _ID_FORMAT))
+    except ValueError:
+        return 0.0
+
+
+@contextmanager
+def _os_errors(path: Path, problem: str) -> Iterator[None]:
+    """Raise `RecordingError` in place of an OSError."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, RecordingError):
+            raise
+        raise RecordingError(f"{path} {problem}: {error.strerror or error}") from None

@@ -1,0 +1,77 @@
+// Results of runs with their intervals, side by side, and pictures that the server draws.
+import { call, fetchPicture, html, interval, sentence, significant, unitText, useEffect, useState } from "./common.js";
+
+/** Quantities of results: title, factor from SI units, and unit. */
+const QUANTITIES = {
+  thrust: ["thrust", 1e3, "mN"],
+  speed: ["speed", 1e3, "mm/s"],
+  frequency: ["frequency", 1, "Hz"],
+  power: ["power", 1e3, "mW"],
+  thrust_per_watt: ["efficiency", 1e3, "mN/W"],
+  relative_thrust: ["of the best square wave", 100, "%"],
+  fin_angle_max: ["largest fin angle", 1e3, "mrad"],
+};
+
+const queryOf = (runs) => new URLSearchParams(runs.map((run) => ["run", run]));
+
+/** Return the results of runs, null until they are there, and why they cannot be read. */
+export function useResults(runs) {
+  const [answer, setAnswer] = useState([null, ""]);
+  useEffect(() => {
+    let isOld = false;
+    call("GET", `/api/results?${queryOf(runs)}`).then((results) => isOld || setAnswer([results, ""]),
+      (error) => isOld || setAnswer([null, error.message]));
+    return () => { isOld = true; };
+  }, [runs.join("/")]);
+  return answer;
+}
+
+/** Runs side by side: a table of their results, and their traces over each other. */
+export function Comparison({ runs, close }) {
+  const [results, failure] = useResults(runs);
+  return html`<section class="comparison" aria-label="Comparison">
+    <div class="head-row"><h3>Comparison</h3><button type="button" onClick=${close}>Close comparison</button></div>
+    ${failure ? html`<p class="note">${sentence(failure)}</p>` : results ? html`<${Results} results=${results} />` : html`<p class="muted">Loading …</p>`}
+    <${Picture} path=${`/api/results.png?${queryOf(runs)}`} title="the runs over each other" /></section>`;
+}
+
+export function Results({ results }) {
+  const rows = results.flatMap((result) => result.rows.map((row) => ({ ...row, result })));
+  const names = Object.keys(QUANTITIES).filter((name) => rows.some(({ values }) => values[name]));
+  const several = results.length > 1;
+  const text = (name, { values, result }) => {
+    if (!values[name]) return "–";
+    const [, factor, unit] = QUANTITIES[name], [value, half] = values[name];
+    const own = name.startsWith("thrust") ? unit.replace("N", result.force_unit) : unit;
+    return name === "relative_thrust" ? `${significant(value * factor, 4)} %` : `${interval(value * factor, half == null ? NaN : half * factor).join(" ")} ${own}`;
+  };
+  return html`
+    ${names.length > 0 && html`<div class="scroll" tabindex="0" role="region" aria-label="Results"><table class="results">
+      <thead><tr>${several && html`<th>run</th>`}<th>controller</th>${names.map((name) => html`<th class="right">${QUANTITIES[name][0]}</th>`)}</tr></thead>
+      <tbody>${rows.map((row) => html`<tr>${several && html`<td>${row.result.name}</td>`}<td>${row.label}</td>
+        ${names.map((name) => html`<td class="right">${text(name, row)}</td>`)}</tr>`)}</tbody></table></div>`}
+    ${results.map(({ name, summary, estimates }) => html`
+      ${summary && html`<p>${several && html`<b>${name}</b>: `}${sentence(summary)}</p>`}
+      ${estimates.length > 0 && html`<ul class="estimates">${estimates.map(([parameter, value, low, high, unit]) => html`<li>${several && `${name}: `}<b>${parameter}</b>
+        ${" "}${significant(value, 4)} ${unitText(unit)} <span class="muted">${low === null || high === null ? "interval unknown"
+          : `${significant(low, 4)} to ${significant(high, 4)}`}</span></li>`)}</ul>`}`)}`;
+}
+
+/** A picture that the server may have to draw first. */
+export function Picture({ path, title }) {
+  const [picture, setPicture] = useState(null), [failure, setFailure] = useState("");
+  useEffect(() => {
+    let address = null, isOld = false;
+    fetchPicture(path).then((blob) => {
+      if (isOld) return;
+      address = URL.createObjectURL(blob);
+      setPicture(address);
+    }, (error) => setFailure(error.message));
+    return () => {
+      isOld = true;
+      if (address) URL.revokeObjectURL(address);
+    };
+  }, [path]);
+  if (failure) return html`<p class="note">${sentence(failure)}</p>`;
+  return picture ? html`<img alt=${`Plot of ${title}`} src=${picture} />` : html`<p class="muted">It is being drawn …</p>`;
+}

@@ -1,0 +1,62 @@
+// The rows of an experiment as a chart: one column over another, with its intervals.
+import { html, useLayoutEffect, useRef, useState } from "./common.js";
+
+const HEIGHT = 220;
+const COLOURS = ["thrust", "phi", "fy", "fin", "alpha", "fx"];
+/** Columns that are drawn in thousandths of their unit. */
+const MILLI = ["thrust", "speed", "power", "thrust_per_watt"];
+
+const titleOf = (name) => (MILLI.includes(name) ? `${name} (× 10⁻³)` : name);
+
+export function Rows({ result: { columns, labels, name: run } }) {
+  const names = Object.keys(columns).filter((name) => !name.endsWith("_ci95")), node = useRef(null);
+  const varied = names.filter((name) => new Set(columns[name]).size > 1);
+  const [x, setX] = useState(varied[0] ?? names[0]);
+  const [y, setY] = useState(["thrust", "speed"].find((name) => names.includes(name)) ?? names.at(-1));
+  const groups = [...new Set(labels)];
+  useLayoutEffect(() => {
+    const factor = MILLI.includes(y) ? 1e3 : 1, half = columns[`${y}_ci95`] ?? [];
+    const order = columns[x].map((_, row) => row).filter((row) => columns[x][row] !== null && columns[y][row] !== null)
+      .sort((a, b) => columns[x][a] - columns[x][b]);
+    const scaled = (column, row) => (column[row] == null ? null : factor * column[row]);
+    const data = [order.map((row) => columns[x][row]),
+      ...groups.map((group) => order.map((row) => (labels[row] === group ? scaled(columns[y], row) : null)))];
+    const style = getComputedStyle(document.documentElement), colour = (name) => style.getPropertyValue(`--${name}`);
+    const axis = { stroke: () => colour("muted"), font: "11px system-ui, sans-serif", ticks: { show: false }, grid: { stroke: () => colour("grid"), width: 1 } };
+    const drawBars = (plot, index) => {
+      const { ctx } = plot;
+      ctx.strokeStyle = colour(COLOURS[(index - 1) % COLOURS.length]);
+      ctx.beginPath();
+      order.forEach((row, place) => {
+        const value = data[index][place], error = scaled(half, row);
+        if (value === null || error === null) return;
+        const left = plot.valToPos(data[0][place], "x", true);
+        ctx.moveTo(left, plot.valToPos(value - error, "y", true));
+        ctx.lineTo(left, plot.valToPos(value + error, "y", true));
+      });
+      ctx.stroke();
+    };
+    const range = (low, high) => [low - 0.05 * (high - low || 1), high + 0.05 * (high - low || 1)];
+    const ends = order.flatMap((row) => [-1, 1].map((sign) => scaled(columns[y], row) + sign * (scaled(half, row) ?? 0)));
+    const plot = new globalThis.uPlot({
+      width: node.current.clientWidth, height: HEIGHT, padding: [10, 12, 0, 0], legend: { show: false },
+      cursor: { drag: { x: false, y: false } }, hooks: { drawSeries: [drawBars] },
+      scales: { x: { time: false, range: (_, low, high) => range(low, high) }, y: { range: () => range(Math.min(...ends), Math.max(...ends)) } },
+      axes: [{ ...axis, size: 24 }, { ...axis, size: 52 }],
+      series: [{}, ...groups.map((_, index) => ({
+        stroke: colour(COLOURS[index % COLOURS.length]), paths: () => null, points: { show: true, size: 7, fill: colour(COLOURS[index % COLOURS.length]) },
+      }))],
+    }, data, node.current);
+    const watch = new ResizeObserver(([{ contentRect }]) => contentRect.width > 0 && plot.setSize({ width: contentRect.width, height: HEIGHT }));
+    watch.observe(node.current);
+    return () => {
+      watch.disconnect();
+      plot.destroy();
+    };
+  }, [columns, x, y]);
+  const choose = (label, value, set) => html`<label>${label} <select value=${value} onChange=${(event) => set(event.target.value)}>
+    ${names.map((name) => html`<option value=${name}>${titleOf(name)}</option>`)}</select></label>`;
+  return html`<figure class="chart curve rows"><figcaption class="filter">${choose("Rows:", y, setY)}${choose("over", x, setX)}
+    ${groups.length > 1 && html`<span class="keys">${groups.map((group, index) => html`<span style=${`--key: var(--${COLOURS[index % COLOURS.length]})`}>${group}</span>`)}</span>`}
+    </figcaption><div class="plot" role="img" aria-label=${`Chart of the rows of ${run}: ${y} over ${x}`} ref=${node}></div></figure>`;
+}
