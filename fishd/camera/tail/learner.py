@@ -105,12 +105,15 @@ class Learner:
         pictures = [picture for _, picture in self._pictures]
         scene = _Scene(pictures, self._size[0] / pictures[0].shape[1])
         traces = _trace_all(scene, pictures)
-        return self._summarise(scene, times, traces, _find_poses(scene.ground, pictures))
+        return self._summarise(scene, times, traces, pictures)
 
     def _summarise(
-        self, scene: "_Scene", times: Array, traces: list[Trace | None], poses: Array
+        self,
+        scene: "_Scene",
+        times: Array,
+        traces: list[Trace | None],
+        pictures: list[Pixels],
     ) -> Learned:
-        """poses: of the camera, 95 % of the pictures have smaller ones"""
         seen = [trace for trace in traces if trace is not None]
         if len(seen) < 0.6 * len(traces):
             raise CannotLearn(
@@ -174,8 +177,7 @@ class Learner:
             direction_error=float(np.quantile(differences[:, 0], 0.95)),
             turn_error=float(np.quantile(differences[:, 1], 0.95)),
             covariance=tuple(tuple(row.tolist()) for row in shape.covariance * scale**2),
-            shift_error=(float(poses[0]) * scale, float(poses[1]) * scale),
-            scene_turn_error=float(poses[2]),
+            pose_error=_find_pose_error(scene, pictures),
         )
 
 
@@ -341,13 +343,13 @@ def _trace_all(scene: _Scene, pictures: list[Pixels]) -> list[Trace | None]:
     return [tracer.trace(picture) for picture in pictures]
 
 
-def _find_poses(ground: Ground, pictures: list[Pixels]) -> Array:
-    """Return the 95 % quantiles of shifts [px of these pictures] and turn [rad] of the scene."""
-    scene = Scene(ground)
+def _find_pose_error(scene: _Scene, pictures: list[Pixels]) -> tuple[float, float, float]:
+    """Return the 95 % quantiles of shifts [px of the whole picture] and turn [rad]."""
+    ground, still = scene.ground, Scene(scene.ground)
     small = [shrink(picture) for picture in pictures]
-    poses = [scene.find_pose(picture, ground.light(picture))[0] for picture in small]
-    quantiles = np.quantile(np.abs(poses), 0.95, axis=0)
-    return np.asarray(quantiles * (ground.scale, ground.scale, 1.0))
+    poses = [still.find_pose(picture, ground.light(picture))[0] for picture in small]
+    along, down, turn = np.quantile(np.abs(poses), 0.95, axis=0).tolist()
+    return ground.scale * scene.factor * along, ground.scale * scene.factor * down, turn
 
 
 def _stations(fin: tuple[float, float]) -> tuple[int, int]:
