@@ -10,6 +10,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from fishd.camera.messages import TailCondition, TailMessage
 from fishd.camera.settings import CameraSettings
 from fishd.camera.tail.learned import Learned
 from fishd.camera.tail.learner import Learner
+from fishd.camera.tail.lens import CannotUseLens, Lens
 from fishd.camera.tail.meter import TailMeter
 from fishd.core import files, text
 from fishd.core.camera_frames import Pixels
@@ -53,7 +55,7 @@ class Measuring:
         self, settings: CameraSettings, path: Path, publish: Callable[[TailMessage], None]
     ) -> None:
         """
-        path: file of what was learned
+        path: file of what was learned, beside which that of the lens lies
         publish: called in the thread with each result
         """
         self._settings = settings.tail
@@ -61,7 +63,8 @@ class Measuring:
         self._row_time = {0: read_out, 180: -read_out}.get(turn, 0.0)
         self._column_time = {90: -read_out, 270: read_out}.get(turn, 0.0)
         """Time between the exposures of the first and the last row, or column, once turned [s]."""
-        self._path = path
+        self._path, self._lens_path = path, path.with_suffix(".lens.json")
+        self._rotate = turn
         self._publish = publish
         self._changed = threading.Condition()
         self._picture: _Picture | None = None
@@ -71,6 +74,9 @@ class Measuring:
         self._is_finishing = self._is_stopping = False
         self.learned: Learned | None = None
         """What was learned of the tail; None if nothing was."""
+        self.lens: Lens | None = None
+        """Calibration of the lens; None without one."""
+        self._lens_problem = ""
         self._meter: TailMeter | None = None
         self.condition: TailCondition = "unlearned" if self._settings.measure else "off"
         self._measuring_problem = self._learning_problem = ""
@@ -79,12 +85,21 @@ class Measuring:
 
     def __enter__(self) -> "Measuring":
         """Load what was learned, and start the thread."""
-        if self._settings.measure and self._path.exists():
+        if self._settings.measure:
             try:
-                self._use(Learned.load(self._path))
+                if self._lens_path.exists():
+                    lens = Lens.load(self._lens_path)
+                    lens.check(lens.size, self._rotate)
+                    self.lens = lens
+                if self._path.exists():
+                    learned = Learned.load(self._path)
+                    learned.check_lens(self.lens)
+                    self._use(learned)
             except FishdError as error:
                 self.condition = "unusable"
                 self._fail_to_measure(text.error_message(error))
+                if isinstance(error, CannotUseLens):
+                    self._lens_problem = self._measuring_problem
         self._thread.start()
         return self
 
@@ -107,12 +122,28 @@ class Measuring:
             self._picture = _Picture(session, seq, moment, pixels)
             self._changed.notify()
 
+    def set_lens(self, lens: Lens) -> None:
+        """Save a calibration, with which the tail has to be learned; raises `CannotUseLens`."""
+        lens.check(lens.size, self._rotate)
+        with suppress(OSError):  # `save` says why
+            self._lens_path.parent.mkdir(parents=True, exist_ok=True)
+        lens.save(self._lens_path)
+        with self._changed:
+            self.lens, self._learner, self._lens_problem = lens, None, ""
+            if self.condition == "off":
+                return
+            self.learned, self._meter, self.condition = None, None, "unlearned"
+            self._learning_problem, self._measuring_problem = "", ""
+
     def begin_learning(self) -> None:
         """Collect pictures from now on; raises `Refused` where measuring is off."""
         if self.condition == "off":
             raise Refused("tail-off", "this camera does not measure: set tail.measure to true")
+        if self._lens_problem:
+            raise Refused("bad-lens", self._lens_problem)
         with self._changed:
-            self._picture, self._learner, self._is_finishing = None, Learner(), False
+            self._picture, self._learner = None, Learner(self.lens)
+            self._is_finishing = False
             self._learning_ends = time.monotonic() + LEARNING_TIMEOUT_S
             self.condition, self._learning_problem = "learning", ""
 
@@ -162,8 +193,9 @@ class Measuring:
         return self._is_stopping or self._is_finishing or self._picture is not None
 
     def _measure(self, picture: _Picture) -> None:
-        if self.learned and (self._meter is None or picture.session != self._session):
-            self._meter, self._session = TailMeter(self.learned), picture.session
+        learned = self.learned
+        if learned and (self._meter is None or picture.session != self._session):
+            self._meter, self._session = TailMeter(learned), picture.session
         if self._meter is None:
             return
         reading = self._meter.read(picture.time, picture.pixels, self._row_time, self._column_time)

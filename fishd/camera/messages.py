@@ -192,6 +192,9 @@ class CameraState(Struct, frozen=True, kw_only=True):
     tail_zero_ci95: Annotated[
         float | None, unit("rad", "Half-width of the 95 % interval of the learned zero.")
     ] = None
+    lens: Annotated[
+        str, note("Date of the calibration of the lens, and its errors; empty: never.")
+    ] = ""
     measured_pictures: Annotated[int, note("Measured pictures, since start.")] = 0
     unmeasured_pictures: Annotated[
         int, note("Pictures without time to measure them, since start.")

@@ -1,14 +1,28 @@
 """Conversion of a camera's picture to the frame for learners and the view for people."""
 
+from contextlib import suppress
+from pathlib import Path
+
 import cv2
 import numpy as np
 import simplejpeg
 
 from fishd.camera.messages import Crop
 from fishd.camera.settings import PictureSettings, PublishSettings
+from fishd.core import files
 from fishd.core.camera_frames import Pixels
 
+_MAX_BYTES = 2**26
 _TURNS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
+
+
+def read_picture(path: Path) -> Pixels | None:
+    """Return the grey levels of the picture in a file; None if it is no such file."""
+    with suppress(files.FileProblem, cv2.error):
+        content = np.frombuffer(files.read(path, _MAX_BYTES, "a picture"), np.uint8)
+        picture = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE)
+        return None if picture is None else np.asarray(picture, np.uint8)
+    return None
 
 
 def rotate(picture: Pixels, settings: PictureSettings) -> Pixels:

@@ -4,7 +4,7 @@ import itertools
 import os
 from contextlib import suppress
 from functools import partial
-from typing import Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Self, TypeVar, cast
 
 import msgspec
 import zmq
@@ -17,6 +17,9 @@ from fishd.core import addresses, protocol, text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, Refused
 from fishd.core.names import find_name_problem
+
+if TYPE_CHECKING:
+    from fishd.camera.tail.lens import Lens
 
 ENDPOINT_VARIABLE = "FISHD_CAMERA"
 MAX_MESSAGE_BYTES = 16 * 2**20
@@ -78,10 +81,22 @@ class CameraRequests:
         """Let the camera forget these pictures, and measure on as before."""
         return self._call(CameraState, "cancel_tail")
 
-    def _call(self, kind: type[T], op: str, timeout: float | None = None) -> T:
+    def lens(self) -> "Lens":
+        """Return the calibration of the camera's lens; raises `Refused` without one."""
+        from fishd.camera.tail.lens import Lens  # with OpenCV
+
+        return self._call(Lens, "lens")
+
+    def set_lens(self, lens: "Lens") -> CameraState:
+        """Let the camera store a calibration of its lens; then the tail has to be learned again."""
+        return self._call(CameraState, "set_lens", args=msgspec.to_builtins(lens))
+
+    def _call(self, kind: type[T], op: str, timeout: float | None = None, **fields: Any) -> T:
         """Send a request and return its result; raises `CameraLost` and `Refused`."""
         identity = next(self._ids)
-        request = protocol.encode(protocol.Request(v=protocol.VERSION, id=identity, op=op))
+        request = protocol.encode(
+            protocol.Request(v=protocol.VERSION, id=identity, op=op, **fields)
+        )
 
         def read(payload: bytes) -> T | None:
             with suppress(msgspec.DecodeError):

@@ -20,8 +20,10 @@ from fishd.camera.monitor import Monitor
 from fishd.camera.settings import CameraSettings, without_password
 from fishd.camera.sockets import Publisher, Requests
 from fishd.camera.sources.base import Shot, Source, Timeline, Trouble
+from fishd.camera.tail.lens import CannotUseLens, Lens
 from fishd.core import text
 from fishd.core.camera_frames import Pixels
+from fishd.core.errors import Refused
 from fishd.core.process.systemd_notify import SystemdNotifier
 
 log = logging.getLogger(__name__)
@@ -79,7 +81,10 @@ class Server:
                 "learn_tail": self._begin_learning,
                 "finish_tail": self._finish_learning,
                 "cancel_tail": self._cancel_learning,
+                "lens": self._lens,
+                "set_lens": self._set_lens,
             }
+            self._requests.arguments = {"set_lens": Lens}
             stack.enter_context(self._measuring)
             self._stack = stack.pop_all()
         return self
@@ -288,6 +293,18 @@ class Server:
         self._measuring.begin_learning()
         return self._state()
 
+    def _lens(self) -> Lens:
+        if self._measuring.lens is None:
+            raise Refused("no-lens", "its lens is not calibrated: run 'fishctl camera lens'")
+        return self._measuring.lens
+
+    def _set_lens(self, lens: Lens) -> CameraState:
+        try:
+            self._measuring.set_lens(lens)
+        except CannotUseLens as error:
+            raise Refused("bad-lens", text.error_message(error)) from None
+        return self._state()
+
     def _finish_learning(self) -> CameraState:
         self._measuring.finish_learning()
         return self._state()
@@ -305,6 +322,7 @@ class Server:
             tail_problem=measuring.problem,
             tail_learned=learned.date if learned else "",
             tail_zero_ci95=learned.zero_ci95 if learned else None,
+            lens=measuring.lens.describe() if measuring.lens else "",
             measured_pictures=measuring.measured,
             unmeasured_pictures=measuring.dropped,
         )

@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import Any
 
+import msgspec
 import zmq
+from msgspec import Struct
 
 from fishd.camera.messages import STATE, VIEW
 from fishd.core import addresses, protocol, text
@@ -82,8 +84,10 @@ class Requests:
         self._stack = ExitStack()
         stack.callback(lambda: self._stack.close())
         self.listen_at(self.address, listener)
-        self.operations: dict[str, Callable[[], Any]] = {}
+        self.operations: dict[str, Callable[..., Any]] = {}
         """Functions that compute the results of requests, by name of the operation."""
+        self.arguments: dict[str, type[Struct]] = {}
+        """Kinds of the arguments of those that take any."""
 
     def listen_at(self, address: str, listener: sockets.socket) -> None:
         """Listen at a new file from now on; all clients connect again."""
@@ -104,9 +108,14 @@ class Requests:
             if request.op not in self.operations:
                 hint = suggest(request.op, list(self.operations))
                 raise Refused("unknown-op", f"no such op '{text.quoted(request.op)}'; {hint}")
-            if request.args:
+            kind = self.arguments.get(request.op)
+            if request.args and kind is None:
                 raise Refused("bad-arguments", f"{request.op} takes no arguments")
-            return protocol.success(request.id, self.operations[request.op]())
+            values = () if kind is None else (msgspec.convert(request.args, kind),)
+            return protocol.success(request.id, self.operations[request.op](*values))
+        except msgspec.ValidationError as error:
+            refusal = Refused("bad-arguments", text.line(str(error)))
+            return protocol.failure(protocol.request_id(payload), refusal)
         except Refused as error:
             return protocol.failure(protocol.request_id(payload), error)
 

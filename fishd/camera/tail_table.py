@@ -12,7 +12,6 @@ import numpy as np
 from msgspec import Struct
 
 from fishd.camera.tail.learned import Learned
-from fishd.camera.tail.profile import Pose
 from fishd.core import files
 from fishd.core.errors import FishdError
 from fishd.core.tail_reading import TailReading
@@ -130,8 +129,7 @@ class TailTable:
         places: Sequence[float | None] = (None, None)
         scale = self.learned.pixels_per_mm
         if scale and reading.tip:
-            pose = Pose(self.learned.root, self.learned.direction)
-            places = (pose.to_axis(np.array(reading.tip)) / scale).tolist()
+            places = (self.learned.to_axis(np.array(reading.tip)) / scale).tolist()
         row = [
             *(_format(value, 6) for value in (reading.time, reading.alpha, reading.uncertainty)),
             *(_format(value, 2) for value in tip),

@@ -5,7 +5,7 @@ import os
 import stat
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, NamedTuple, Self
+from typing import NamedTuple, Self
 
 # They must be set before OpenCV is loaded and opens a file. A file may name others as its parts.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
@@ -18,6 +18,7 @@ from fishd.camera.picture import rotate
 from fishd.camera.settings import PictureSettings
 from fishd.camera.tail.learned import Learned
 from fishd.camera.tail.learner import CannotLearn, Learner
+from fishd.camera.tail.lens import Lens, Turn
 from fishd.core import files, text
 from fishd.core.camera_frames import Pixels
 from fishd.core.errors import FishdError
@@ -28,8 +29,6 @@ _MAX_RATE_HZ = 10_000.0
 _STREAM_BEGINS = b"\xff\xd8", b"\0\0\1", b"\0\0\0\1"
 """First bytes of JPEG, H.264 and H.265 pictures in a row, without a container that has times."""
 _PROGRAM_STREAM_BEGINS = b"\0\0\1\xba"
-Turn = Literal[0, 90, 180, 270]
-"""Clockwise rotation of a picture [degrees]."""
 
 
 class CannotReadVideo(FishdError, ValueError):
@@ -143,13 +142,13 @@ class Video:
             raise CannotReadVideo(f"{self.shown} contains no picture that can be read")
 
 
-def learn(video: Video) -> tuple[Learned, float]:
+def learn(video: Video, lens: Lens | None = None) -> tuple[Learned, float]:
     """Return what a video shows of the tail, and where the part begins that shows it [s].
 
     That is the first part of 20 s in which the fish swims.
     Raises `CannotLearn` for the first part if no part shows it, and `CannotReadVideo`.
     """
-    learner, begin = Learner(), 0.0
+    learner, begin = Learner(lens), 0.0
     problem: CannotLearn | None = None
     for picture in itertools.chain(video.pictures(), [None]):
         if picture is None or picture.time - begin >= LEARN_S:
@@ -159,6 +158,6 @@ def learn(video: Video) -> tuple[Learned, float]:
                 problem = problem or error
         if picture is not None:
             if picture.time - begin >= LEARN_S:
-                learner, begin = Learner(), picture.time
+                learner, begin = Learner(lens), picture.time
             learner.add(picture.time, picture.pixels)
     raise CannotLearn(f"{video.shown}: {problem}")

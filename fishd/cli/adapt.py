@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING
 import click
 import msgspec
 
-from fishd.cli.experiment import MEASURED_TAIL, ChosenFish, Resumable, Run, experiment_options
+from fishd.cli.experiment import (
+    LIVE,
+    MEASURED_TAIL,
+    ChosenFish,
+    Resumable,
+    Run,
+    experiment_options,
+)
 from fishd.cli.options import FiniteRange, seed_option
 from fishd.cli.output import echo
 
@@ -40,7 +47,8 @@ DEFAULT_STEPS = 6400
     click.option(
         "--no-command",
         is_flag=True,
-        help="Live: leave the fish at rest at the end. [default: swim the chosen gait]",
+        help="leave the fish at rest at the end. [default: swim the chosen gait]",
+        **LIVE,
     ),
     tail=MEASURED_TAIL,
     plot="command, fin, force and thrust of each gait",
@@ -59,12 +67,14 @@ def adapt(budget: float, steps: int, seed: int, no_command: bool, run: Run) -> N
     """
     for package in ("onnxruntime", "tensorboard"):  # before the fish swims
         import_module(package)
+    from fishd.lab.error_budget import estimate_thrust
     from fishd.lab.session import LiveSession
-    from fishd.learning.adapt import adaptation
 
-    run.fish.refuse_other({}, {"--no-command": no_command})
     session = run.session()
     session.check_calibrated()
+    run.end_dry_run(budget, "s", budget if run.fish.on == "live" else None)
+    from fishd.learning.adapt import adaptation  # imports torch
+
     run.open({"budget": budget, "steps": steps, "seed": seed})
     with run.swimming(budget, "s of tank time") as show:
         paths = run.pictures("gaits")
@@ -79,6 +89,8 @@ def adapt(budget: float, steps: int, seed: int, no_command: bool, run: Run) -> N
         adapted,
         lambda: _print_result(adapted),
         kept=msgspec.to_builtins(adapted) | measured | summary,
+        estimates=[estimate_thrust(gait.contestant, gait, session.unit) for gait in adapted.gaits],
+        headline=f"Verdict: {adapted.verdict}.",
     )
     run.echo_pictures(paths)
     again = f"to swim it again: {format_command(chosen, run.fish)}"

@@ -9,12 +9,20 @@ from msgspec.structs import replace
 
 from fishd.cli.completion import complete_contestant
 from fishd.cli.controller_arguments import ControllersCommand
-from fishd.cli.experiment import MEASURED_TAIL, Resumable, Run, experiment_options
+from fishd.cli.experiment import (
+    LIVE,
+    MEASURED_TAIL,
+    SIMULATED,
+    Resumable,
+    Run,
+    experiment_options,
+)
 from fishd.cli.options import camera_config_option, for_option
 from fishd.cli.output import echo, echo_table
 from fishd.config import Config, check_tethered
 from fishd.core import text
 from fishd.core.errors import FishdError, ParameterError, install_command
+from fishd.core.experiments import Estimate
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -60,7 +68,8 @@ class _CompareCommand(ControllersCommand, Resumable):
     click.option(
         "--settle",
         type=float,
-        help=f"In simulation: time before the measurement [s]. [default: {DEFAULT_SETTLE_S}]",
+        help=f"time before the measurement [s]. [default: {DEFAULT_SETTLE_S}]",
+        **SIMULATED,
     ),
     click.option(
         "--camera",
@@ -68,12 +77,13 @@ class _CompareCommand(ControllersCommand, Resumable):
         help="For policies that see pictures, live: request address of fishd-camera. [default: "
         "$FISHD_CAMERA, else that of this machine]",
     ),
-    camera_config_option("For policies that see pictures, in simulation: "),
+    camera_config_option("for policies that see pictures, ", **SIMULATED),
     click.option(
         "--agent",
         metavar="ADDRESS",
-        help="For policies that see pictures, on a remote robot: address at which its fishd "
+        help="for policies that see pictures, on a remote robot: address at which its fishd "
         "reaches this program. [default: any free port of this machine]",
+        **LIVE,
     ),
     tail=MEASURED_TAIL,
     plot="command, fin, force and result of each",
@@ -108,9 +118,6 @@ def compare(
     Exit status 1 if this fish refuses a contestant, such as a policy for another amplitude, or if
     a run ends in mode fault; the other contestants are still compared.
     """
-    run.fish.refuse_other(
-        {"--settle": settle, "--camera-config": camera_config}, {"--agent": agent}
-    )
     settings = {"for": seconds, "settle": settle}
     if run.fish.on == "live":
         outcome = _measure(run, contestants, settings, runs or 1, camera, agent)
@@ -183,10 +190,11 @@ def _measure(
     _check_camera(camera, chosen)
     live = LiveComparison(session, chosen)
     live.check(seconds)  # before the experiment has a folder
+    unit = session.unit
     run.open(settings | {"contestants": list(map(list, chosen))})
     try:
-        with run.swimming(len(chosen) * runs * seconds):
-            live.swim(seconds, runs)
+        with run.swimming(len(chosen) * runs * seconds) as show:
+            live.swim(seconds, runs, lambda: show.estimate(_list_estimates(live.standings(), unit)))
     except ParameterError:
         raise
     except FishdError as reason:  # the runs until then are shown
@@ -246,10 +254,12 @@ def _report(outcome: _Outcome, runs: int, run: Run) -> int:
         if sentence := _describe_best_square(standings):
             echo(sentence)
         if verdict:
-            echo(f"Verdict: {verdict.sentence}.")
+            echo(headline)
 
     results = [to_builtins(s) | {"verdict": _verdict_on(s.contestant, best)} for s in standings]
-    run.show(results, print_table)
+    headline = f"Verdict: {verdict.sentence}." if verdict else ""
+    estimates = _list_estimates(standings, outcome.unit)
+    run.show(results, print_table, estimates=estimates, headline=headline)
     remarks = []
     measured = [standing for standing in standings if not standing.runs]
     if measured and (line := warn_of_unknown_calibration(measured[0], outcome.unit)):
@@ -265,6 +275,12 @@ def _report(outcome: _Outcome, runs: int, run: Run) -> int:
     for remark in remarks:
         echo(f"fishctl: {remark}", err=True)
     return 1 if faults or outcome.left_out else 0
+
+
+def _list_estimates(standings: "list[Standing]", unit: str) -> list[Estimate]:
+    from fishd.lab.error_budget import estimate_thrust
+
+    return [estimate_thrust(standing.contestant, standing, unit) for standing in standings]
 
 
 def _verdict_on(contestant: str, best: tuple[str, ...]) -> str | None:

@@ -186,7 +186,7 @@ class ControllerGroup(click.Group):
         self.subcommand_metavar = "CONTROLLER [OPTIONS]"
         self._options = options
         self._remote = remote
-        self._kind, self._several = kind, kind is ValuesType
+        self.kind, self._several = kind, kind is ValuesType
         self._action: Callable[..., Any] = lambda: None
 
     def action(self, function: F) -> F:
@@ -210,7 +210,7 @@ class ControllerGroup(click.Group):
 
     def _find_words(self, ctx: click.Context, args: list[str]) -> Iterator[int]:
         """Yield the places of the arguments that are neither options nor their values."""
-        params = getattr(self._options(cast(Any, lambda: None)), "__click_params__", [])
+        params = self.own_params()
         flags = {*ctx.help_option_names, *(n for p in params if p.is_flag for n in p.opts)}
         is_value = False
         for place, word in enumerate(args):
@@ -244,6 +244,11 @@ class ControllerGroup(click.Group):
             raise click.UsageError(str(error), ctx) from None
         return [name, *(f"--{key.replace('_', '-')}={value}" for key, value in pairs)]
 
+    def own_params(self) -> list[click.Option]:
+        """Return the options of the verb itself, in the order of its help."""
+        decorated = self._options(cast(Any, lambda: None))
+        return list(reversed(getattr(decorated, "__click_params__", [])))
+
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of the controllers that are installed here."""
         from fishd.controllers import registry
@@ -275,7 +280,7 @@ class ControllerGroup(click.Group):
         command = click.command(cmd_name, _ControllerCommand, help=summary, short_help=summary)(
             decorated
         )
-        command.params = parameter_options(fields.values(), self._kind) + command.params
+        command.params = parameter_options(fields.values(), self.kind) + command.params
         return command
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -285,8 +290,7 @@ class ControllerGroup(click.Group):
         """
         from fishd.controllers import registry
 
-        decorated = self._options(cast(Any, lambda: None))
-        params = reversed(getattr(decorated, "__click_params__", []))
+        params = self.own_params()
         records = [record for param in params if (record := param.get_help_record(ctx))]
         with formatter.section("Options"):
             formatter.write_dl([*records, ("-h, --help", "Show this message and exit.")])

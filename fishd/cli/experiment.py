@@ -6,7 +6,8 @@ same again: of a live fish the session has the finished swims in its log, and a 
 them again, with the same noise.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import wraps
 from importlib.util import find_spec
@@ -17,14 +18,17 @@ import click
 from msgspec import to_builtins
 from msgspec.structs import replace
 
-from fishd.cli import dry_run
 from fishd.cli.config import config_option, set_option
 from fishd.cli.controller_arguments import ControllerGroup
 from fishd.cli.experiment_options import (
+    FishOption,
     On,
     default_on,
+    dry_run_option,
+    end_dry_run,
     kept_arguments,
     on_option,
+    refuse_other_fish,
     restore_arguments,
 )
 from fishd.cli.options import (
@@ -37,11 +41,12 @@ from fishd.cli.options import (
     verb_lease,
 )
 from fishd.cli.output import echo, print_json
-from fishd.cli.progress import Lines, show_progress
+from fishd.cli.progress import Lines, report_progress, show_progress
 from fishd.config import Config, Start, load
 from fishd.core.addresses import find_control_address
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError
+from fishd.core.experiments import Estimate, Plan, Progress
 from fishd.core.process.interruption import raise_on_first_signal
 from fishd.core.signals import Event, Tick
 
@@ -49,7 +54,11 @@ if TYPE_CHECKING:
     from fishd.lab.experiment import Experiment
     from fishd.lab.session import Session
 
-MEASURED_TAIL = "Live: measure the largest fin angle, too."
+LIVE: dict[str, Any] = {"cls": FishOption, "on": "live"}
+"""Settings of an option that only applies to a live fish."""
+SIMULATED: dict[str, Any] = {"cls": FishOption, "on": "simulation"}
+"""Settings of an option that only applies to a simulated fish."""
+MEASURED_TAIL = "measure the largest fin angle, too."
 """Help of `--tail` of a verb that measures thrust."""
 
 
@@ -72,15 +81,6 @@ class ChosenFish(NamedTuple):
     def load(self, overrides: Sequence[str] = ()) -> Config:
         """Return the configuration of a simulated fish at rest; raises `ConfigError`."""
         return replace(load(self.file, (*self.overrides, *overrides)), start=Start())
-
-    def refuse_other(
-        self, simulation_options: Mapping[str, Any], live_options: Mapping[str, Any]
-    ) -> None:
-        """Raise `UsageError` for an option that only applies to the other kind of fish."""
-        live = self.on == "live"
-        for name, value in (simulation_options if live else live_options).items():
-            if value not in (None, (), False):
-                raise click.UsageError(f"{name} is for --on {'simulation' if live else 'live'}")
 
 
 class Ending:
@@ -154,13 +154,19 @@ class Run:
         as_json: bool,
         keeps_simulations: bool,
         uses_tail: bool = False,
+        is_dry: bool = False,
     ) -> None:
-        """Raises `UsageError`, and `FishdError` for a picture that cannot be drawn."""
+        """Raises `UsageError`, and `FishdError` for a picture that cannot be drawn.
+
+        is_dry: whether the verb ends before the fish swims
+        """
         from fishd.lab import drawing
         from fishd.lab.experiment import default_folder
 
         if folder and resume:
             raise click.UsageError("--folder is for a new experiment, --resume for one: give one")
+        if is_dry and resume:
+            raise click.UsageError("--dry-run is for a new experiment")
         if keeps_simulations:
             drawing.check_installed()
         if picture:
@@ -177,7 +183,10 @@ class Run:
         """Whether the fin angles of a camera are used."""
         self._keeps = keeps_simulations or fish.on == "live" or self.has_folder
         self._command = kept_arguments(context)
+        self._is_dry = is_dry
         self._stack = ExitStack()
+        if is_dry:
+            self.folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory())) / "dry"
         self._session: Session | None = None
         self._has_begun = False
         """Whether it has printed which fish it is about."""
@@ -200,10 +209,6 @@ class Run:
             self._session = self._open_session(**piloted)
         return self._session
 
-    def refuse_simulated_tail(self) -> None:
-        """Raise `UsageError` where fin angles are to be measured of a fish without a camera."""
-        self.fish.refuse_other({}, {"--tail": self.uses_tail})
-
     def _open_session(self, **piloted: Any) -> "Session":
         session = self._open_fish(**piloted)
         if self.uses_tail and self.fish.on == "live":
@@ -223,11 +228,13 @@ class Run:
         from fishd.client import Fish
 
         fish = self._stack.enter_context(Fish(self.fish.endpoint))
+        name, takes = verb_lease()
+        lease = name, takes or self._is_dry  # which takes nothing, but is not refused either
         if not piloted:
-            return LiveSession(fish, *verb_lease())
+            return LiveSession(fish, *lease)
         from fishd.lab.compare.piloted_session import PilotedSession
 
-        return PilotedSession(fish, *verb_lease(), **piloted)
+        return PilotedSession(fish, *lease, **piloted)
 
     @property
     def experiment(self) -> "Experiment":
@@ -268,9 +275,9 @@ class Run:
     def echo(self, line: str = "") -> None:
         """Print a line, and before the first one which fish it is about.
 
-        If the output is JSON, it is on standard error.
+        If the output is JSON, it is on standard error. A dry run prints none.
         """
-        if dry_run.is_active.get():
+        if self._is_dry:
             return
         if not self._has_begun:
             self._has_begun = True
@@ -300,7 +307,8 @@ class Run:
         from fishd.lab.swim_log import SwimLog
         from fishd.recording.folder import list_recordings
 
-        dry_run.end_of_check(total - since if unit == "s" and self.fish.on == "live" else None)
+        is_time = self.fish.on == "live" and unit.startswith("s")
+        self.end_dry_run(total, unit, total if is_time else None)
         self.echo()
         session, experiment, began = self._session, self._experiment, False
         with self.ending.measuring(), ExitStack() as stack:
@@ -324,15 +332,31 @@ class Run:
         if not began:
             self.check("before anything was measured")
 
+    def end_dry_run(self, total: float, unit: str, seconds: float | None = None) -> None:
+        """End the verb if it is a dry run; seconds: duration of `total` [s], None if unknown."""
+        if self._is_dry:
+            end_dry_run(Plan(total, unit, seconds), self.as_json)
+
     def check(self, done: str = "the fish rests") -> None:
         """End the verb if a signal has ended the measurement; done: what was finished, in words."""
         self.ending.check(done)
 
-    def show(self, result: Any, print_result: Callable[[], None], *, kept: Any = None) -> None:
+    def show(
+        self,
+        result: Any,
+        print_result: Callable[[], None],
+        *,
+        kept: Any = None,
+        estimates: Sequence[Estimate] = (),
+        headline: str = "",
+    ) -> None:
         """Write a result into the folder, and print it, as JSON or by `print_result`.
 
         kept: what is written, if that is more than what is printed as JSON
+        estimates, headline: the result in short, for a page
         """
+        if estimates or headline:
+            report_progress(Progress(1.0, 0.0, headline, list(estimates)))
         if self._experiment:
             self._experiment.write_result(result if kept is None else kept)
         if self.as_json:
@@ -393,11 +417,13 @@ def experiment_options(
             as_json: bool,
             picture: Path | None = None,
             uses_tail: bool = False,
+            is_dry: bool = False,
             **values: Any,
         ) -> Any:
             if on is None and resume:
                 on = _read_on(resume)
             on = on or default_on(file, overrides, endpoint)
+            refuse_other_fish(click.get_current_context(), on)
             if on == "live" and (file or overrides) and not live_config:
                 name = "--config" if file else "--set"
                 raise click.UsageError(
@@ -412,9 +438,8 @@ def experiment_options(
                 as_json=as_json,
                 keeps_simulations=keeps_simulations,
                 uses_tail=uses_tail,
+                is_dry=is_dry,
             ) as run:
-                if uses_tail and not live_config:
-                    run.refuse_simulated_tail()
                 return function(*args, run=run, **values)
 
         scope = "" if live_config else "In simulation: "
@@ -423,7 +448,8 @@ def experiment_options(
         for option in (
             json_option,
             *([plot_option(plot)] if plot else []),
-            *([tail_option(tail)] if tail else []),
+            *([tail_option(tail, **({} if live_config else LIVE))] if tail else []),
+            dry_run_option,
             take_option,
             endpoint_option,
             set_option,

@@ -1,20 +1,22 @@
-"""Options of experiments that are also those of other verbs: `--on`, and `--resume`."""
+"""Options of experiments that are also those of other verbs: `--on`, `--dry-run`, `--resume`."""
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, NoReturn
 
 import click
 
+from fishd.cli.output import echo, print_json
 from fishd.core.addresses import ENDPOINT_VARIABLE, find_control_address, socket_path
+from fishd.core.experiments import Plan
 from fishd.core.process import unix_sockets
 
 On = Literal["live", "simulation"]
 RUN_ONLY_OPTIONS = {
     "--folder": 1, "--resume": 1, "--plot": 1, "--json": 0, "--take": 0, "--on": 1, "--endpoint": 1,
-    "--cluster": 1,
+    "--cluster": 1, "--dry-run": 0,
 }  # fmt: skip
 """Options that are not kept as they are given, and the number of words after each.
 
@@ -29,6 +31,44 @@ on_option = click.option(
     help="live: the fish of the running fishd, real or simulated; simulation: a fish in virtual "
     "time. [default: live if a fishd runs and neither --config nor --set is given]",
 )
+
+dry_run_option = click.option(
+    "--dry-run",
+    "is_dry",
+    is_flag=True,
+    help="Check all of it, print how long it takes, and end: the fish rests.",
+)
+
+
+class FishOption(click.Option):
+    """Option that applies to one kind of fish only: `on`."""
+
+    def __init__(self, *names: Any, on: On, **settings: Any) -> None:
+        super().__init__(*names, **settings)
+        self.on = on
+        scope = "Live" if on == "live" else "In simulation"
+        self.help = f"{scope}: {self.help}"
+
+
+def refuse_other_fish(context: click.Context, on: On) -> None:
+    """Raise `UsageError` for an option that only applies to the other kind of fish."""
+    for option in context.command.params:
+        if isinstance(option, FishOption) and option.on != on:
+            source = context.get_parameter_source(option.name or "")
+            if source is click.core.ParameterSource.COMMANDLINE:
+                raise click.UsageError(f"{option.opts[0]} is for --on {option.on}")
+
+
+def end_dry_run(plan: Plan, as_json: bool) -> NoReturn:
+    """Print what an experiment is going to do, and end its verb."""
+    if as_json:
+        print_json(plan)
+    elif plan.amount:
+        unit = "" if plan.seconds is None or plan.unit.startswith("s") else f", {plan.seconds:g} s"
+        echo(f"nothing is wrong with it; it takes {plan.amount:g} {plan.unit}{unit}")
+    else:
+        echo("nothing is wrong with it")
+    raise click.exceptions.Exit(0)
 
 
 def default_on(file: Path | None, overrides: tuple[str, ...], endpoint: str | None) -> On:

@@ -3,19 +3,21 @@
 import shlex
 from copy import deepcopy
 from datetime import datetime
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from fishd.cli.experiment import Resumable, Run, experiment_options
-from fishd.cli.options import FiniteRange, for_option
+from fishd.cli.options import FiniteRange, NamesType, for_option
 from fishd.cli.output import echo
 from fishd.cli.progress import show_waiting
 from fishd.cli.recording.files import open_recording
 from fishd.config import Config, ServoSettings, adopt, check_tethered, load
 from fishd.core import files
 from fishd.core.errors import FishdError
+from fishd.core.experiments import Estimate
 from fishd.recording.folder import list_recordings
 from fishd.recording.reader import open_run
 
@@ -37,6 +39,7 @@ DEFAULT_EXPERIMENT_S = 180.0
     ),
     click.option(
         "--fit",
+        type=NamesType(),
         metavar="NAME,...",
         help="Parameters to fit; the others keep their configured values. [default: omega0, xi, "
         "quadratic_drag, coupling, servo_speed, servo_lag, thrust_coefficient, "
@@ -45,6 +48,8 @@ DEFAULT_EXPERIMENT_S = 180.0
     ),
     click.option(
         "--fix",
+        type=NamesType(),
+        default=(),
         metavar="NAME,...",
         help="Known parameters, which are not fitted: lateral_inertia_ratio if K_y = K, or "
         "coupling if λ was measured.",
@@ -73,8 +78,8 @@ def identify(
     runs: tuple[str, ...],
     experiment: bool,
     seconds: float | None,
-    fit: str | None,
-    fix: str | None,
+    fit: tuple[str, ...] | None,
+    fix: tuple[str, ...],
     target: Path | None,
     force: bool,
     tail_scale: float,
@@ -93,16 +98,14 @@ def identify(
     for option, is_given in (("--for", seconds is not None), ("--folder", run.has_folder)):
         if is_given and not experiment:
             raise click.UsageError(f"{option} goes with --experiment")
-    if experiment and run.uses_tail:
-        run.refuse_simulated_tail()
+    if experiment and run.uses_tail and run.fish.on == "simulation":
+        raise click.UsageError("--tail is for --on live")
     if target and target.exists() and not force:
         raise FishdError(f"{target}: exists already; --force overwrites it, --to names another")
 
     from fishd.lab import identification as lab
 
-    names = None if fit is None else _parse_names(fit)
-    fixed = _parse_names(fix or "")
-    lab.check(lab.DEFAULT if names is None else names, fixed)  # before minutes of swimming
+    lab.check(lab.DEFAULT if fit is None else fit, fix)  # before minutes of swimming
     if experiment:
         config, tables, servo = _swim_experiment(run, seconds or DEFAULT_EXPERIMENT_S)
         origin = f"an experiment with {run.fish}"
@@ -110,14 +113,15 @@ def identify(
         config, servo = load(run.fish.file, run.fish.overrides), None
         check_tethered(config.robot, "identify")
         tables = [open_recording(name, None) for name in runs]
+        run.end_dry_run(len(tables), "recordings")
         origin = ", ".join(table.path.name for table in tables)
     with show_waiting("fitting the model to the forces"):
         identification = lab.identify(
             tables,
             start=config.plant,
             rig=config.simulation,
-            fit=names,
-            fix=fixed,
+            fit=fit,
+            fix=fix,
             servo=servo,
             tail_scale=tail_scale if run.uses_tail else None,
         )
@@ -126,6 +130,12 @@ def identify(
         result,
         lambda: _print_result(identification, origin),
         kept=result | {"summary": identification.summary},
+        estimates=[
+            Estimate(e.name, e.value, e.ci95_low, e.ci95_high, e.unit)
+            for e in identification.estimates
+            if e.fitted and isfinite(e.ci95_low) and isfinite(e.ci95_high)
+        ],
+        headline=identification.headline,
     )
     for remark in identification.remarks:
         echo(f"fishctl: careful: {remark}", err=True)
@@ -135,10 +145,6 @@ def identify(
         from fishd.lab.identification.figure import draw
 
         draw(identification, run.kept_picture)
-
-
-def _parse_names(listed: str) -> tuple[str, ...]:
-    return tuple(filter(None, listed.replace(" ", "").split(",")))
 
 
 def _swim_experiment(run: Run, seconds: float) -> "tuple[Config, list[Any], ServoSettings | None]":

@@ -9,6 +9,7 @@ from fishd.cli.options import FiniteRange, for_option
 from fishd.cli.output import echo, format_controller
 from fishd.controllers.base import Limits
 from fishd.core.console import format_power
+from fishd.core.experiments import CurvePoint
 
 if TYPE_CHECKING:
     from fishd.lab.measurement import Summary
@@ -43,7 +44,7 @@ def _measure(
 ) -> None:
     from fishd.core.swim_plan import plan
     from fishd.lab import measurement, measurement_figure
-    from fishd.lab.error_budget import warn_of_unknown_calibration
+    from fishd.lab.error_budget import Thrust, estimate_thrust, warn_of_unknown_calibration
     from fishd.lab.session import LiveSession
     from fishd.lab.sweep import grid
 
@@ -52,8 +53,13 @@ def _measure(
     if run.fish.on == "live":
         grid.check_remote([grid.Point(name, parameters)], Limits(session.amplitude, session.tick))
     run.open({"controller": name, "parameters": parameters, "for": seconds, "settle": settle})
-    with run.swimming(seconds):
-        measured = measurement.measure(session, name, parameters, seconds, settle)
+    with run.swimming(seconds) as show:
+
+        def show_thrust(thrust: Thrust, swims: int) -> None:
+            point = CurvePoint(swims, thrust.thrust, thrust.known_ci95, "swims", unit=session.unit)
+            show.estimate([estimate_thrust("thrust", thrust, session.unit)], point)
+
+        measured = measurement.measure(session, name, parameters, seconds, settle, show_thrust)
     run.check()
     result = measured.summary()
     if (
@@ -62,7 +68,8 @@ def _measure(
         and not result.remark
     ):
         session.fish.calibrate_thrust(result.factor, result.factor_ci95)
-    run.show(result, lambda: _print_result(result, run))
+    estimates = [estimate_thrust("thrust", result, session.unit)]
+    run.show(result, lambda: _print_result(result, run), estimates=estimates)
     if line := warn_of_unknown_calibration(result, result.force_unit):
         echo(f"fishctl: {line}", err=True)
     if run.picture:

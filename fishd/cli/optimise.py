@@ -17,6 +17,7 @@ from fishd.controllers.base import Limits
 from fishd.core import text
 from fishd.core.console import format_power
 from fishd.core.errors import ParameterError
+from fishd.core.experiments import CurvePoint, Estimate
 from fishd.core.schema import Field, format_values, units_of
 
 if TYPE_CHECKING:
@@ -119,6 +120,7 @@ def _optimise(
     run: Run,
 ) -> int:
     from fishd.core.swim_plan import MEAN_REST_S
+    from fishd.lab import error_budget
     from fishd.lab.optimise.choice import Choice
     from fishd.lab.optimise.result import make_optimum
     from fishd.lab.optimise.trials import Aim, TrialTable, measure_trials, trial_durations
@@ -160,7 +162,9 @@ def _optimise(
                 table.add(trial)
                 best = search.propose() if search.is_warm else None
                 line = _format_trial(len(trials), trial, best, session.unit, units)
-                show.done(line, trial.tank_time)
+                show.done(line, trial.tank_time, _curve_point(trials, units, session.unit))
+                if best:
+                    show.estimate(_list_estimates(best, units))
     if not trials:
         run.check("before the first candidate was measured")
         raise ParameterError(f"a budget of {budget:g} s is too short for the first candidate")
@@ -170,7 +174,14 @@ def _optimise(
         optimum = replace(optimum, choice_time=choice.waited)
     else:
         optimum = _add_truth(optimum, run.fish, fixed)
-    run.show(optimum, lambda: _print_optimum(optimum, session.unit, units, run.folder))
+    run.show(
+        optimum,
+        lambda: _print_optimum(optimum, session.unit, units, run.folder),
+        estimates=[
+            *_list_estimates(optimum, units),
+            error_budget.estimate_thrust("thrust there", optimum, session.unit),
+        ],
+    )
     _draw(run, search, trials, proposal, units, _axis_label(aim, session.unit))
     run.check(f"{format_count(len(trials), 'candidate')} are kept")
     if choice.is_done(proposal):
@@ -231,6 +242,24 @@ def _draw(
     paths = run.pictures("thrust")
     draw(paths, search, proposal, units, label)
     run.echo_pictures(paths)
+
+
+def _list_estimates(best: "Proposal | Optimum", units: dict[str, str]) -> list[Estimate]:
+    """Return the best parameters with their intervals."""
+    low, high = best.parameters_ci95_low, best.parameters_ci95_high
+    return [
+        Estimate(f"best {name}", value, low[name], high[name], units[name])
+        for name, value in best.parameters.items()
+    ]
+
+
+def _curve_point(trials: "Sequence[Trial]", units: dict[str, str], force_unit: str) -> CurvePoint:
+    """Return the latest trial, over its parameter if one is searched, else over its number."""
+    trial, x, x_name = trials[-1], float(len(trials)), "candidate"
+    if len(trial.parameters) == 1:
+        ((name, x),) = trial.parameters.items()
+        x_name = f"{name} [{units[name]}]"
+    return CurvePoint(x, trial.thrust, trial.thrust_ci95, x_name, unit=force_unit)
 
 
 def _axis_label(aim: "Aim", unit: str) -> str:

@@ -58,9 +58,16 @@ def verb_lease() -> VerbLease:
 
 
 def for_option(
-    about: str, *, default: float | None = None, kind: click.ParamType[Any] | None = None
+    about: str,
+    *,
+    default: float | None = None,
+    kind: click.ParamType[Any] | None = None,
+    **settings: Any,
 ) -> Callable[[F], F]:
-    """Return the option `--for`, a duration; `--seconds` is another name for it."""
+    """Return the option `--for`, a duration; `--seconds` is another name for it.
+
+    settings: further ones of `click.option`
+    """
     return click.option(
         "--for",
         "--seconds",
@@ -70,6 +77,7 @@ def for_option(
         default=default,
         show_default=default is not None,
         help=about,
+        **settings,
     )
 
 
@@ -84,13 +92,18 @@ def plot_option(about: str) -> Callable[[F], F]:
     )
 
 
-def tail_option(about: str) -> Callable[[F], F]:
-    """Return the option `--tail`; about: what it does with the fin angles of a camera."""
+def tail_option(about: str, **settings: Any) -> Callable[[F], F]:
+    """Return the option `--tail`.
+
+    about: what it does with the fin angles of a camera
+    settings: further ones of `click.option`
+    """
     return click.option(
         "--tail",
         "uses_tail",
         is_flag=True,
         help=f"{about} The camera is that of $FISHD_CAMERA, else that of this machine.",
+        **settings,
     )
 
 
@@ -105,13 +118,17 @@ def seed_option(what: str, default: int | None = 0) -> Callable[[F], F]:
     )
 
 
-def camera_config_option(scope: str = "") -> Callable[[F], F]:
-    """Return the option `--camera-config`; scope: when it can be given."""
+def camera_config_option(scope: str = "", **settings: Any) -> Callable[[F], F]:
+    """Return the option `--camera-config`.
+
+    scope: when it can be given; settings: further ones of `click.option`
+    """
     return click.option(
         "--camera-config",
         metavar="FILE",
         help=f"{scope}YAML file of a simulated camera, such as config/camera-web.yaml. [default: a "
         "good camera]",
+        **settings,
     )
 
 
@@ -131,6 +148,20 @@ class FiniteRange(click.FloatRange):
         if not math.isfinite(number):
             self.fail(f"'{value}' is not valid: a finite number is needed", param, ctx)
         return number
+
+
+class NamesType(click.ParamType[tuple[str, ...]]):
+    """List of names such as `omega0,xi`, as a tuple."""
+
+    name = "names"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, ...]:
+        """Convert a text to the names in it."""
+        if not isinstance(value, str):
+            return tuple(value)
+        return tuple(filter(None, value.replace(" ", "").split(",")))
 
 
 class Utf8Text(click.ParamType[str]):

@@ -1,5 +1,6 @@
 """Printing of values: control characters of a daemon or a file never reach the terminal."""
 
+import os
 import re
 import sys
 import time
@@ -69,8 +70,9 @@ def echo_table(table: "Table") -> None:
 
 
 def print_json(value: Any) -> None:
-    """Print any struct, or list of them, as one indented JSON document."""
-    click.echo(_escape_unprintable(msgspec.json.format(msgspec.json.encode(value), indent=2)))
+    """Print any struct, or list of them, as one indented JSON document; a path is a text there."""
+    document = msgspec.json.encode(value, enc_hook=os.fspath)
+    click.echo(_escape_unprintable(msgspec.json.format(document, indent=2)))
 
 
 def print_paths(paths: Iterable[Path], as_json: bool) -> None:
@@ -82,9 +84,9 @@ def print_paths(paths: Iterable[Path], as_json: bool) -> None:
             echo(path)
 
 
-def print_json_line(value: Any) -> None:
-    """Print any struct as one line of JSON."""
-    click.echo(_escape_unprintable(msgspec.json.encode(value)))
+def print_json_line(value: Any, *, err: bool = False) -> None:
+    """Print any struct as one line of JSON; err: on standard error."""
+    click.echo(_escape_unprintable(msgspec.json.encode(value)), err=err)
 
 
 def make_printable(value: T) -> T:

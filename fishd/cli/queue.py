@@ -1,23 +1,27 @@
 """The verbs of the queue of experiments of a fish."""
 
+import io
 import shlex
 import time
+from collections.abc import Sequence
+from contextlib import redirect_stdout
 from datetime import datetime, timedelta
 from functools import wraps
 from typing import Any
 
 import click
+import msgspec
 
-from fishd.cli import dry_run
 from fishd.cli.options import F, Utf8Text, daemon_options, take_option, verb_lease
 from fishd.cli.output import echo, echo_table, format_count, print_json
-from fishd.core.errors import FishdError
+from fishd.core.errors import FishdError, NoDaemon
 from fishd.core.experiment_queue import MAX_ITEMS, MAX_REPEAT, QueueFile, View
+from fishd.core.experiments import Plan
 from fishd.recording.folder import runs_folder
 
 EXPERIMENTS = ("measure", "sweep", "compare", "optimise", "identify", "adapt", "learn")
 """Verbs that a queue takes."""
-_CHOSEN_OPTIONS = ("--folder", "--resume", "--endpoint", "--json", "--take")
+_CHOSEN_OPTIONS = ("--folder", "--resume", "--endpoint", "--json", "--take", "--dry-run")
 """Options of an experiment that the queue chooses."""
 
 
@@ -56,9 +60,10 @@ def _queue_options(function: F) -> F:
 def add(
     context: click.Context, words: tuple[str, ...], repeat: int, file: QueueFile, as_json: bool
 ) -> None:
-    """Add an experiment at the end: its words after 'fishctl', such as measure swing --for 60.
+    """Add an experiment: the words after 'fishctl'.
 
-    The words are checked now, as its verb does before the fish swims.
+    For example: fishctl queue add measure swing --for 60 --repeat 3. The words are checked now, as
+    their verb does before the fish swims.
     """
     if words[0] not in EXPERIMENTS:
         known = ", ".join(EXPERIMENTS)
@@ -66,7 +71,7 @@ def add(
     for word in words:
         if word.partition("=")[0] in _CHOSEN_OPTIONS:
             raise click.UsageError(f"{word.partition('=')[0]} is chosen by the queue; leave it out")
-    seconds = dry_run.check(context, words, file.address)
+    seconds = _check(context.find_root().command, words, file.address)
     with file.changing() as content:
         item = content.add(list(words), repeat, seconds)
     if as_json:
@@ -75,6 +80,25 @@ def add(
         each = "" if seconds is None else f", {_format_duration(seconds)} each"
         runs = format_count(repeat, "run")
         echo(f"experiment {item.id}: {shlex.join(words)} ({runs}{each})")
+
+
+def _check(fishctl: click.Command, words: Sequence[str], address: str) -> float | None:
+    """Return the expected duration of an experiment [s]; None if it is not known.
+
+    What only its fishd knows is not checked if that does not answer. Raises the errors of the verb.
+    """
+    place = ["--folder", "checked", "--dry-run", "--json"]
+    plan = io.StringIO()
+    try:
+        with redirect_stdout(plan):
+            fishctl.main(
+                ["--endpoint", address, *words, *place],
+                prog_name="fishctl",
+                standalone_mode=False,
+            )
+    except NoDaemon:
+        return None
+    return msgspec.json.decode(plan.getvalue(), type=Plan).seconds
 
 
 @queue.command("list")
@@ -138,7 +162,7 @@ def _format_time(t: float) -> str:
 @click.argument("position", type=click.IntRange(1, MAX_ITEMS))
 @_queue_options
 def move(number: int, position: int, file: QueueFile, as_json: bool) -> None:
-    """Move an experiment to a position, 1 for the first."""
+    """Move an experiment; position 1 is the first."""
     with file.changing() as content:
         content.move(number, position)
     _show(file, as_json)
@@ -148,7 +172,7 @@ def move(number: int, position: int, file: QueueFile, as_json: bool) -> None:
 @click.argument("number", type=int)
 @_queue_options
 def remove(number: int, file: QueueFile, as_json: bool) -> None:
-    """Remove an experiment that does not run; what it has measured is kept."""
+    """Remove an experiment that does not run. What it has measured is kept."""
     with file.changing() as content:
         content.remove(number)
     _show(file, as_json)
@@ -157,7 +181,7 @@ def remove(number: int, file: QueueFile, as_json: bool) -> None:
 @queue.command()
 @_queue_options
 def clear(file: QueueFile, as_json: bool) -> None:
-    """Remove all experiments but the one that runs; all runs are kept."""
+    """Remove all experiments but the one that runs. All runs are kept."""
     with file.changing() as content:
         content.clear()
     _show(file, as_json)

@@ -6,7 +6,6 @@ itself.
 """
 
 import os
-import signal
 import subprocess
 import threading
 import time
@@ -19,7 +18,8 @@ from fishd.core import files, text
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import ConfigError, FishError
 from fishd.core.experiment_queue import MAX_PAST, Item, Outcome, Past, Queue, QueueError, QueueFile
-from fishd.core.process.interruption import on_signal
+from fishd.core.experiments import PROGRESS_PREFIX
+from fishd.core.process.interruption import SIGNALS, handle_signals
 from fishd.lab.experiment import Header, find_answer, read_header
 from fishd.window.children import fishctl_command
 
@@ -56,7 +56,8 @@ class QueueRunner:
                 queue.reason, queue.pauses = "", False
                 if queue.pause_at is not None and queue.pause_at <= time.time():
                     queue.pause_at = None
-            with on_signal(self._stop):
+            # Later ones, too: the end of a program with threads sends its children several.
+            with handle_signals(SIGNALS, self._stop):
                 while item := self._begin_next():
                     if not self._finish(item, self._run(item)):
                         break
@@ -69,7 +70,7 @@ class QueueRunner:
             return INTERRUPTED
         return 0 if not queue.reason or self._is_requested else 1
 
-    def _stop(self) -> None:
+    def _stop(self, *_: object) -> None:
         """Interrupt the run that goes on, and pause."""
         self._is_stopped = True
 
@@ -123,7 +124,7 @@ class QueueRunner:
         self._take, self._last_line = False, ""
         echo(f"fishctl: experiment {item.id}: {' '.join(item.words)}", err=True)
         try:
-            # Its own session: Ctrl-C in this terminal is for the runner, which passes it on once.
+            # In a session of its own, as Ctrl-C in this terminal is for the runner.
             child = subprocess.Popen(
                 fishctl_command(words),
                 stdin=subprocess.DEVNULL,
@@ -151,7 +152,7 @@ class QueueRunner:
                 return child.wait(POLL_S)
             if not is_interrupted and self._is_interruption_due():
                 is_interrupted = True
-                child.send_signal(signal.SIGINT)
+                child.terminate()
 
     def _is_interruption_due(self) -> bool:
         """Return whether the run that goes on is to be interrupted."""
@@ -165,7 +166,8 @@ class QueueRunner:
     def _read_lines(self, child: "subprocess.Popen[str]") -> None:
         assert child.stderr
         for line in child.stderr:
-            self._last_line = text.line(line).removeprefix("fishctl: ")
+            if not line.startswith(PROGRESS_PREFIX.decode()):  # which is for a page
+                self._last_line = text.line(line).removeprefix("fishctl: ")
             with suppress(OSError):  # the terminal is gone; the run goes on
                 echo(line.rstrip(), err=True)
 

@@ -9,13 +9,22 @@ import msgspec
 from msgspec.structs import replace
 
 from fishd.cli.controller_arguments import ValuesType
-from fishd.cli.experiment import MEASURED_TAIL, ChosenFish, ResumableGroup, Run, experiment_options
+from fishd.cli.experiment import (
+    LIVE,
+    MEASURED_TAIL,
+    SIMULATED,
+    ChosenFish,
+    ResumableGroup,
+    Run,
+    experiment_options,
+)
 from fishd.cli.options import FiniteRange, for_option
 from fishd.cli.output import echo, format_count, format_ratio, format_speed, warn_of_fin
 from fishd.config import Config
 from fishd.controllers.base import Limits
 from fishd.core import text
 from fishd.core.errors import ConfigError
+from fishd.core.experiments import CurvePoint
 from fishd.core.process.interruption import Interrupted
 from fishd.core.signals import ControllerInfo
 
@@ -32,32 +41,37 @@ sweep_options = experiment_options(
         "--vary",
         multiple=True,
         metavar="KEY=VALUES",
-        help="In simulation: a key of the configuration with several values, such as "
-        "plant.xi=0.6,1.2,2.4 or plant.omega0=8:14:2. Repeatable.",
+        help="a key of the configuration with several values, such as plant.xi=0.6,1.2,2.4 or "
+        "plant.omega0=8:14:2. Repeatable.",
+        **SIMULATED,
     ),
     click.option(
         "--settle",
         type=FiniteRange(0.0, 100_000.0),
-        help="In simulation: time before the measured beats [s]. [default: 10; of a free fish "
-        "4, or until its speed is steady]",
+        help="time before the measured beats [s]. [default: 10; of a free fish 4, or until its "
+        "speed is steady]",
+        **SIMULATED,
     ),
     click.option(
         "--periods",
         type=click.IntRange(2, 10_000),
-        help="In simulation: measured tail beats of each point; of a free fish, the "
-        "smallest number. [default: 20; of a free fish 10]",
+        help="measured tail beats of each point; of a free fish, the smallest number. [default: "
+        "20; of a free fish 10]",
+        **SIMULATED,
     ),
-    for_option(f"Live: swimming and resting at each point [s]. [default: {DEFAULT_POINT_S:g}]"),
+    for_option(f"swimming and resting at each point [s]. [default: {DEFAULT_POINT_S:g}]", **LIVE),
     click.option(
         "--jobs",
         type=click.IntRange(min=1),
-        help="In simulation: number of processes. [default: number of cores]",
+        help="number of processes. [default: number of cores]",
+        **SIMULATED,
     ),
     click.option(
         "--cluster",
         metavar="ADDRESS",
-        help="In simulation: let the workers of a Dask cluster swim; address of its scheduler, "
-        "or its file NAME.json. --resume without it swims on this machine.",
+        help="let the workers of a Dask cluster swim; address of its scheduler, or its file "
+        "NAME.json. --resume without it swims on this machine.",
+        **SIMULATED,
     ),
     tail=MEASURED_TAIL,
     plot="the curves",
@@ -92,11 +106,6 @@ def _sweep(
 ) -> int:
     from fishd.lab.sweep import grid
 
-    simulation_options = {
-        "--vary": vary, "--settle": settle, "--periods": periods, "--jobs": jobs,
-        "--cluster": cluster,
-    }  # fmt: skip
-    run.fish.refuse_other(simulation_options, {"--for": seconds})
     names = [info.name for info in infos]
     accepted = {info.name: [field.name for field in info.parameters] for info in infos}
     points = grid.make_points(names, parameters, accepted, _parse_variations(vary))
@@ -149,7 +158,7 @@ def _swim(
             for point, result in results:
                 finished += 1
                 line = f"{point.label()}: {_format_result(result, folder.quantity)}"
-                show.done(line, finished)
+                show.done(line, finished, _curve_point(point, points, result, folder.quantity))
         if finished < len(points):
             raise Interrupted
     return folder
@@ -171,8 +180,32 @@ def _measure(run: Run, points: "list[Point]", seconds: float) -> "SweepFolder":
     with run.swimming(len(points) * seconds, since=since, recorded=False) as show:
         for point, result in measure_all(folder, points, session, seconds):
             line = f"{point.label()}: {_format_result(result, folder.quantity)}"
-            show.done(line, since + session.used)
+            curve_point = _curve_point(point, points, result, folder.quantity)
+            show.done(line, since + session.used, curve_point)
     return folder
+
+
+def _curve_point(
+    point: "Point", points: "Sequence[Point]", result: "PointResult", quantity: "Quantity"
+) -> CurvePoint | None:
+    """Return a result over the first number that varies; None if it has none, or no result."""
+    from fishd.controllers import registry
+
+    units = registry.units(point.controller)
+    values = point.columns()
+    for name, x in values.items():
+        is_number = isinstance(x, int | float) and not isinstance(x, bool)
+        if is_number and len({other.columns().get(name) for other in points}) > 1:
+            break
+    else:
+        return None
+    if result.value is None:
+        return None
+    ci95, unit = result.value_ci95, quantity.unit
+    series = point.label(without=(name,))
+    x_name = name.rpartition(".")[2]
+    x_name += f" [{units[x_name]}]" if units.get(x_name, "1") != "1" else ""
+    return CurvePoint(x, result.value, ci95, x_name, quantity.name, unit, series)
 
 
 def _configure_points(fish: ChosenFish, points: "list[Point]") -> "list[tuple[Point, Config]]":

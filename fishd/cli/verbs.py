@@ -4,6 +4,7 @@ import gc
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import click
@@ -36,6 +37,13 @@ _EXTRAS = {
     "torch": "learn",
 }
 """Extra of fishd that installs a package, by module name."""
+
+
+def missing_package(name: str) -> str:
+    """Return how to install a package of an extra; empty if it is installed."""
+    if find_spec(name):
+        return ""
+    return f"{name} is not installed; install it with: {install_command(_EXTRAS[name])}"
 
 
 class Verb(NamedTuple):
@@ -82,8 +90,7 @@ class Verbs(click.Group):
             package = (error.name or "").partition(".")[0]
             if package not in _EXTRAS:
                 raise
-            remedy = install_command(_EXTRAS[package])
-            complain("fishctl", f"{package} is not installed; install it with: {remedy}", 1)
+            complain("fishctl", missing_package(package), 1)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all verbs, in the order of help."""

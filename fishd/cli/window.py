@@ -78,6 +78,19 @@ def start(log_format: str, **values: Any) -> None:
     exit_now(serve(load_options(**values), log_format))
 
 
+@window.command(hidden=True)
+@json_option
+def forms(as_json: bool) -> None:
+    """List the forms of the page's experiments."""
+    from fishd.cli.forms import describe_forms
+
+    described = describe_forms()
+    if as_json:
+        print_json(described)
+    for form in () if as_json else described:
+        echo(f"{form.title}: {form.about}")
+
+
 @window.command()
 @window_options
 @click.option(

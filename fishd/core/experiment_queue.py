@@ -43,12 +43,12 @@ class QueueError(FishdError):
     """A queue cannot be read or changed."""
 
 
-class Item(Struct):
+class Item(Struct, forbid_unknown_fields=True):
     """An experiment that waits or runs."""
 
     id: int
     words: list[str]
-    """Its verb and arguments."""
+    """Verb and arguments."""
     cwd: str
     """Folder in which it was added, to which relative paths belong."""
     repeat: Repeat = 1
@@ -59,7 +59,7 @@ class Item(Struct):
     """Name of the folder of the run that has begun, or was interrupted and is resumed."""
 
 
-class Past(Struct):
+class Past(Struct, forbid_unknown_fields=True):
     """A run that has ended."""
 
     words: list[str]
@@ -68,10 +68,10 @@ class Past(Struct):
     """Unix time [s]."""
     outcome: Outcome
     message: str = ""
-    """Its result, or the reason why it failed."""
+    """Result, or the reason of a failure."""
 
 
-class Queue(Struct):
+class Queue(Struct, forbid_unknown_fields=True):
     """Content of the file."""
 
     version: int = VERSION
@@ -140,7 +140,7 @@ class Queue(Struct):
 
 
 class View(Queue):
-    """The queue as it is shown; `current` is the item that runs."""
+    """A queue for display; `current` is the item that runs."""
 
     state: Literal["running", "paused", "empty"] = "empty"
     elapsed: float = 0.0
@@ -178,6 +178,8 @@ class QueueFile:
     def read(self) -> Queue:
         """Return the queue; raise `QueueError` for a file that this fishd does not understand."""
         try:
+            if self.path.is_symlink():
+                raise FileProblem("is a symbolic link; a regular file is needed")
             content = files.read(self.path, MAX_FILE_BYTES, "a queue")
             if (version := _decode_version(content).version) > VERSION:
                 raise QueueError(
@@ -199,7 +201,7 @@ class QueueFile:
     def changing(self) -> Iterator[Queue]:
         """Yield the newest queue, which is written at the end, while no other process changes it.
 
-        Raise `QueueError`; the file is then as it was.
+        Raise `QueueError`, without a change of the file.
         """
         try:
             self.runs.mkdir(parents=True, exist_ok=True)
@@ -216,7 +218,7 @@ class QueueFile:
             raise
         except OSError as error:
             raise QueueError(
-                f"{self.path} cannot be written: {error.strerror}; the queue is as it was"
+                f"{self.path} cannot be written: {error.strerror}; the queue is unchanged"
             ) from None
 
     @contextmanager
@@ -234,9 +236,11 @@ class QueueFile:
         return find_lock_holder(self._runner)
 
     def view(self) -> View:
-        """Return the queue as it is shown; raise `QueueError`."""
+        """Return the queue for display; raise `QueueError`."""
+        is_running = self.find_runner() is not None  # first: a runner that ends has written before
         queue = self.read()
-        is_running = self.find_runner() is not None
+        if not is_running and queue.current is not None:
+            is_running = self.find_runner() is not None  # it may have begun since
         if not is_running:
             _forget_killed_runner(queue)
         elapsed = max(0.0, time.time() - queue.began) if queue.current is not None else 0.0

@@ -17,6 +17,7 @@ from fishd.core import text
 from fishd.core.beats import upward_reversals
 from fishd.core.calibration import ForceCalibration
 from fishd.core.estimation import SWIM_SETTLE_TIME_S
+from fishd.core.experiments import Estimate
 from fishd.core.signals import Tick
 from fishd.lab.statistics import Z95, per_watt
 
@@ -63,6 +64,13 @@ class Thrust(Struct, frozen=True, kw_only=True):
     def known_ci95(self) -> float | None:
         """Total half-width of the thrust; the statistical one if the total is unknown [N]."""
         return self.thrust_ci95 if self.total_ci95 is None else self.total_ci95
+
+
+def estimate_thrust(name: str, thrust: Thrust, unit: str) -> Estimate:
+    """Return a thrust with its interval; unit: that of the force."""
+    half = thrust.known_ci95
+    low, high = (None, None) if half is None else (thrust.thrust - half, thrust.thrust + half)
+    return Estimate(name, thrust.thrust, low, high, unit)
 
 
 class Budget(NamedTuple):

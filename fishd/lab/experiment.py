@@ -19,6 +19,7 @@ from msgspec import Struct
 from fishd import __version__
 from fishd.core import files, text
 from fishd.core.errors import ConfigError, FishdError
+from fishd.core.experiments import CurvePoint, Estimate
 from fishd.core.files import FileProblem, write_atomically
 from fishd.core.process.lockfile import LockHeld, NotALock, find_lock_holder, locked
 from fishd.lab import tables
@@ -42,11 +43,14 @@ T = TypeVar("T", bound=Struct)
 class Progress(Protocol):
     """Display of an experiment's progress, implemented by `fishd.cli.progress.Lines`."""
 
-    def done(self, line: str, amount: float) -> None:
+    def done(self, line: str, amount: float, point: CurvePoint | None = None) -> None:
         """Show a finished step; amount: amount of the total that is finished by now."""
 
     def at(self, amount: float, result: str | None = None) -> None:
         """Show the amount of the total that is finished by now, and a new preliminary result."""
+
+    def estimate(self, estimates: Sequence[Estimate], point: CurvePoint | None = None) -> None:
+        """Show the best values until now, and a new point of their curve."""
 
     def warn(self, line: str) -> None:
         """Show a warning on standard error."""

@@ -1,7 +1,8 @@
 """Measurement of the thrust of a controller, with its interval, by swimming and resting in turn."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from itertools import groupby, pairwise
 from typing import Any, NamedTuple
 
@@ -115,26 +116,48 @@ def measure(
     parameters: Mapping[str, Any],
     seconds: float = 60.0,
     settle: float = SWIM_SETTLE_TIME_S,
+    heard: Callable[[Thrust, int], None] | None = None,
 ) -> ThrustMeasurement:
     """Swim a controller and rest in turn for `seconds`, and return its thrust.
 
     The rests separate the drift of the sensor: see `fishd.lab.drift`.
     settle: time the fin needs to swim steadily, or to hang still again [s]
+    heard: called in each rest with the thrust until then, and the number of swims
 
     Raises `ParameterError` for a time that is too short, `Disturbed` (also where too many ticks
     were lost on the way from fishd), and the errors of `Session.swim`.
     """
     ticks: list[Tick] = []
     phases = plan(seconds, parameters, settle)
-    for swims, length in phases:
+    for index, (swims, length) in enumerate(phases):
         ticks += session.swim(controller, parameters, length) if swims else session.rest(length)
+        if heard and index and not swims and index < len(phases) - 1:
+            with suppress(ParameterError):  # one swim may be too little
+                heard(_evaluate_ticks(session, ticks, settle), (index + 1) // 2)
     refuse_lost(ticks, (length for _, length in phases), session.tick)
-    samples = to_samples(ticks)
-    measurement = evaluate(samples, session.tick, settle, rest_settle_time(settle))
+    measurement, samples = _evaluate_ticks(session, ticks, settle), to_samples(ticks)
     if not measurement.frequency and len({sample.phi_c for sample in samples if sample.swims}) > 1:
         raise ParameterError(
             "no whole beat is left of a swim; lengthen the swims with a longer --settle"
         )
+    fields: dict[str, Any] = {}
+    if session.fin_angles and measurement.frequency:  # noise of a resting fin is not a beat
+        fields = session.fin_angles.find_maximum(ticks, settle)
+    return replace(
+        measurement,
+        **fields,
+        controller=controller,
+        parameters=dict(parameters),
+        ticks=ticks,
+        seconds=len(ticks) * session.tick,
+        force_unit=session.unit,
+    )
+
+
+def _evaluate_ticks(session: Session, ticks: Sequence[Tick], settle: float) -> ThrustMeasurement:
+    """Return the thrust with its error budget, without controller and fin angle."""
+    settles = settle, rest_settle_time(settle)
+    measurement = evaluate(to_samples(ticks), session.tick, *settles)
     rotation, lateral = visible_rotation(ticks), lateral_force(ticks)
     fields = thrust_fields(
         session.calibration,
@@ -145,18 +168,7 @@ def measure(
         lateral=lateral,
         rotation=rotation,
     )
-    if session.fin_angles and measurement.frequency:  # noise of a resting fin is not a beat
-        fields |= session.fin_angles.find_maximum(ticks, settle)
-    return replace(
-        measurement,
-        **fields,
-        controller=controller,
-        parameters=dict(parameters),
-        ticks=ticks,
-        seconds=len(ticks) * session.tick,
-        force_unit=session.unit,
-        lateral=lateral,
-    )
+    return replace(measurement, **fields, lateral=lateral)
 
 
 def to_samples(ticks: Iterable[Tick]) -> list[Sample]:

@@ -28,7 +28,7 @@ from fishd.lab.run_traces import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
@@ -76,10 +76,13 @@ def draw_run(traces: Traces, path: str | os.PathLike[str]) -> None:
             _mean_beat(beat, traces, traces.portrait)
 
 
-def draw_runs(runs: "Mapping[str, Traces]", path: str | os.PathLike[str]) -> None:
+def draw_runs(
+    runs: "Mapping[str, Traces]", left_out: "Sequence[str]", path: str | os.PathLike[str]
+) -> None:
     """Write a figure with several runs over each other: thrust, beat, and mean beat of each.
 
     runs: traces by the name of their run; time begins with the swim
+    left_out: names of runs that have no recording
 
     Raises `FishdError` where writing fails, and `MissingPackage`.
     """
@@ -102,7 +105,8 @@ def draw_runs(runs: "Mapping[str, Traces]", path: str | os.PathLike[str]) -> Non
         for axis in (thrust, force):
             axis.axhline(0.0, color="0.85", linewidth=0.6)
         thrust.set_ylabel(f"thrust ({plain(', '.join(units))})")
-        thrust.set_title("thrust over whole beats, and its 95 % interval")
+        missing = f"; no recording: {plain(', '.join(left_out))}" if left_out else ""
+        thrust.set_title(f"thrust over whole beats, and its 95 % interval{missing}")
         beat.set_ylabel("tail beat (Hz)")
         beat.set_xlabel("time since the first beat (s)")
         force.set_ylabel(f"mean $F_x$ ({plain(', '.join(units))})")

@@ -62,7 +62,7 @@ class Row(Struct):
 
 
 class Estimate(NamedTuple):
-    """Parameter that an experiment has found."""
+    """Parameter in the result of an experiment."""
 
     name: str
     value: float
@@ -150,20 +150,20 @@ def _list_estimates(result: Mapping[str, Any]) -> Iterator[Estimate]:
     with suppress(UnknownController):
         units = registry.units(controller) if controller else {}
     lows, highs = (result.get(f"parameters_ci95_{end}") or {} for end in ("low", "high"))
-    found = [
+    values = [
         (name, parameters.get(name), low, highs.get(name), units.get(name, ""))
         for name, low in lows.items()
     ]
     if name := result.get("x_name"):  # the best point of a curve
         ends = (result.get("x_ci95_low"), result.get("x_ci95_high"))
-        found.append((name, result.get("x"), *ends, units.get(name, "")))
+        values.append((name, result.get("x"), *ends, units.get(name, "")))
     fitted = result.get("fitted") or {}
     identified = fitted.get("identification", result) if isinstance(fitted, dict) else result
     for name, estimate in (identified.get("estimates") or {}).items():
         if estimate.get("fitted", True):
             ends = (estimate.get("ci95_low"), estimate.get("ci95_high"))
-            found.append((name, estimate["value"], *ends, estimate.get("unit", "")))
-    for name, value, low, high, unit in found:
+            values.append((name, estimate["value"], *ends, estimate.get("unit", "")))
+    for name, value, low, high, unit in values:
         if (number := read_number(value)) is not None:
             yield Estimate(str(name), number, read_number(low), read_number(high), str(unit))
 

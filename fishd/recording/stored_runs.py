@@ -28,7 +28,7 @@ KEPT_DAYS = 30
 """Time for which a deleted run stays in the trash [days]."""
 PACKED_SUFFIXES = (SUFFIX, ".png", ".parquet", ".onnx", ".zip")
 """Endings of files that are compressed already."""
-_NAME = re.compile(r"\w[\w. -]{0,99}")
+_NAME = re.compile(r"(?!.*\.part$)\w[\w. -]{0,99}")
 _ID, _ID_FORMAT = re.compile(r"\d{8}-\d{6}(-\d+)?", re.A), "%Y%m%d-%H%M%S"
 _READ_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 
@@ -88,10 +88,10 @@ def rename_run(path: Path, name: str) -> Path:
 
 
 def delete_run(path: Path) -> DeletedRun:
-    """Move a run into the trash, and remove what was there too long; raise `RecordingError`."""
+    """Move a run into the trash, and remove older ones from it; raise `RecordingError`."""
     _refuse_in_progress(path)
     trash = path.parent / TRASH
-    with _os_errors(trash, "cannot take it; 'fishctl runs delete --forever' deletes it for ever"):
+    with _os_errors(trash, "cannot take it; 'fishctl runs trash --empty' makes room"):
         trash.mkdir(exist_ok=True)
         if trash.is_symlink():
             raise OSError(errno.ELOOP, "it is a symbolic link", str(trash))
@@ -102,16 +102,9 @@ def delete_run(path: Path) -> DeletedRun:
     except RecordingError:
         place.rmdir()
         raise
-    empty_trash(path.parent, KEPT_DAYS)
+    with suppress(RecordingError):
+        empty_trash(path.parent, KEPT_DAYS)
     return DeletedRun(place.name, _name_of(path), _deletion_time(place), str(place / path.name))
-
-
-def delete_forever(path: Path) -> None:
-    """Remove a run without a way back; raise `RecordingError`."""
-    _refuse_in_progress(path)
-    with _os_errors(path, "cannot be deleted"):
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-        note_path(path).unlink(missing_ok=True)
 
 
 def list_trash(folder: Path) -> list[DeletedRun]:

@@ -4,10 +4,12 @@ import asyncio
 import os
 import shlex
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from fishd.core import text
 from fishd.core.errors import FishdError
+from fishd.core.experiments import PROGRESS_VARIABLE
 from fishd.core.process.safe_path import python_command
 
 _CHILD = """\
@@ -37,7 +39,12 @@ async def spawn(words: list[str], runs: Path) -> asyncio.subprocess.Process:
         stdin=asyncio.subprocess.DEVNULL,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
-        env={**os.environ, "FISHD_RUNS": str(runs), "PYTHONUNBUFFERED": "1"},
+        env={
+            **os.environ,
+            "FISHD_RUNS": str(runs),
+            "PYTHONUNBUFFERED": "1",
+            PROGRESS_VARIABLE: "json",
+        },
         start_new_session=True,  # Ctrl-C in this terminal is for the window
     )
 
@@ -45,7 +52,12 @@ async def spawn(words: list[str], runs: Path) -> asyncio.subprocess.Process:
 async def call(words: list[str], runs: Path) -> bytes:
     """Run fishctl like `spawn`, and return its output; raise `JobError`."""
     process = await spawn(words, runs)
-    output, errors = await process.communicate()
+    try:
+        output, errors = await process.communicate()
+    finally:
+        if process.returncode is None:  # nobody waits for it any more
+            with suppress(ProcessLookupError):
+                process.kill()
     if process.returncode and not output:
         message = text.line(errors.decode("utf-8", "replace")).removeprefix("fishctl: ")
         raise JobError(message or f"{shlex.join(words)} failed")

@@ -36,7 +36,7 @@ ENDINGS = {
     "rows.csv": "-rows.csv",
     "all.zip": ".zip",
 }
-"""What the name of a downloaded file adds to that of its run, by the name of the download."""
+"""Ending that a downloaded file adds to the name of its run, by the name of the download."""
 
 Read = Callable[[], Awaitable[bytes]]
 """Function that returns the next piece of a download; empty at its end."""

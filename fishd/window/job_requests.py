@@ -1,20 +1,28 @@
 """Requests of a page for experiments, and for the runs that they leave."""
 
-from collections.abc import Collection, Iterator
+import asyncio
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 from aiohttp import web
 from msgspec import Struct
 
 from fishd.core import text
 from fishd.core.errors import ParameterError
-from fishd.core.signals import ControllerInfo
-from fishd.core.swim_plan import plan
+from fishd.core.experiments import Form, Plan
 from fishd.window.access import AccessControl
 from fishd.window.answers import ApiError, NoArguments, convert, read_body, success
+from fishd.window.children import JobError
 from fishd.window.fish_link import Busy, FishLink
-from fishd.window.job_options import DRIVING_KINDS, KINDS, MEASURED_KINDS, list_words
+from fishd.window.job_options import (
+    QUEUE,
+    QueueOptions,
+    ResumeOptions,
+    check_parameters,
+    list_words,
+    swims,
+)
 from fishd.window.jobs import Jobs
 from fishd.window.pages import Pages
 from fishd.window.run_requests import RunRequests
@@ -31,6 +39,15 @@ class JobRequest(Struct, forbid_unknown_fields=True):
     options: dict[str, Any] = {}
 
 
+class WantedJob(NamedTuple):
+    """Job that a page wants, with checked options."""
+
+    form: Form | None
+    """None for an experiment that is resumed."""
+    link: FishLink
+    options: Any
+
+
 class JobRequests:
     """The requests about jobs and runs."""
 
@@ -40,6 +57,7 @@ class JobRequests:
         self.folder = jobs.runs.folder
         """Folder of recordings and experiments."""
         self.routes = [
+            web.get("/api/forms", self._list_forms),
             web.get("/api/jobs", self._list_jobs),
             web.post("/api/jobs", self._start_job),
             web.post("/api/jobs/check", self._check_job),
@@ -65,52 +83,88 @@ class JobRequests:
         self._access.require(request, "watch")
         return success(self._jobs.all())
 
-    async def _read_job(self, request: web.Request) -> tuple[JobRequest, FishLink, Any]:
-        """Return the job that a page wants, its fish, and its options; raise `ApiError`."""
-        body = await read_body(request, JobRequest)
-        return body, *self.check_job(body)
+    async def _list_forms(self, request: web.Request) -> web.Response:
+        self._access.require(request, "watch")
+        return success([form for form, _ in (await self._jobs.forms.all()).values()])
 
-    def check_job(self, body: JobRequest) -> tuple[FishLink, Any]:
-        """Return the fish of a job, and its options; raise `ApiError`."""
+    async def _read_job(self, request: web.Request) -> WantedJob:
+        """Return the job that a page wants; raise `ApiError` and `JobError`."""
+        return await self.check_job(await read_body(request, JobRequest))
+
+    async def check_job(self, body: JobRequest) -> WantedJob:
+        """Return a job with checked options; raise `ApiError` and `JobError`."""
         link = self._pages.find_link(body.fish)
-        if body.kind not in KINDS:
-            message = f"no such kind '{text.quoted(body.kind)}'; valid: {', '.join(KINDS)}"
+        if body.kind == "resume":
+            return WantedJob(None, link, convert(body.options, ResumeOptions, "resume: "))
+        if body.kind == QUEUE.kind:
+            return WantedJob(QUEUE, link, convert(body.options, QueueOptions, "queue: "))
+        forms = await self._jobs.forms.all()
+        if body.kind not in forms:
+            message = f"no such kind '{text.quoted(body.kind)}'; valid: {', '.join(forms)}, resume"
             raise ApiError(400, "unknown-kind", message)
-        options = convert(body.options, KINDS[body.kind], f"{body.kind}: ")
+        form, kind = forms[body.kind]
+        options = convert(body.options, kind, f"{body.kind}: ")
         if getattr(options, "parameters", None):
-            _check_parameters(options, link.controllers)
-        if body.kind in MEASURED_KINDS:
-            _check_length(options)
-        return link, options
+            if not link.controllers:
+                message = "fishd has not answered yet, so no controller is known"
+                raise ApiError(503, "no-daemon", message)
+            check_parameters(options, link.controllers)
+        return WantedJob(form, link, options)
+
+    async def _plan(self, job: WantedJob) -> Plan | None:
+        """Return what an experiment is going to do; raise `ApiError` if it cannot."""
+        if job.form is None:
+            return None
+        try:
+            with self.waiting_for_disk():
+                return await self._jobs.forms.plan(job.form, job.options, job.link.endpoint_options)
+        except JobError as error:
+            raise ApiError(400, "bad-arguments", str(error)) from None
 
     async def _check_job(self, request: web.Request) -> web.Response:
-        """Answer with the command line of a job, and what is wrong with it; start nothing."""
-        self._access.require(request, "watch")
+        """Answer with the command line of a job, its plan, and what is wrong with it."""
+        access = self._access.require(request, "watch")
+        plan = None
         try:
-            body, _, options = await self._read_job(request)
-        except ApiError as error:
-            return success({"command": [], "problem": str(error)})
-        words = [body.kind] if body.kind == "resume" else list_words(body.kind, options)
-        return success({"command": ["fishctl", *words], "problem": ""})
+            job = await self._read_job(request)
+            if access.scope == "drive":
+                plan = await self._plan(job)
+        except (ApiError, JobError, ParameterError) as error:
+            return success({"command": [], "problem": str(error), "plan": None})
+        words = list_words(job.form, job.options) if job.form else ["resume"]
+        return success({"command": ["fishctl", *words], "problem": "", "plan": plan})
 
     async def _start_job(self, request: web.Request) -> web.Response:
         access = self._access.require(request, "drive")
-        body, link, options = await self._read_job(request)
+        form, link, options = wanted = await self._read_job(request)
         page = self._pages.find_page(request, access)
+        with self.waiting_for_disk():
+            drives = await self._drives(wanted)
 
         def check() -> None:
             self._access.require(request, "drive")
-            if body.kind in DRIVING_KINDS:
+            if drives:
                 self._pages.require_driver(link.name, page)
 
         check()
-        if body.kind in DRIVING_KINDS:
+        plan = await self._plan(wanted)
+        check()
+        if drives:
             await link.give_back()  # the experiment takes the fish itself
         endpoint, device = link.endpoint_options, access.device_id
         with self.waiting_for_disk():
-            job = await self._jobs.start(body.kind, link.name, endpoint, options, device, check)
+            job = await self._jobs.start(form, link.name, endpoint, options, device, check, plan)
         self._pages.tell_job(job)
         return success(job)
+
+    async def _drives(self, job: WantedJob) -> bool:
+        """Return whether a job swims the live fish."""
+        if job.form is QUEUE:
+            return True
+        if job.form:
+            return swims(job.form, job.options) and job.options.on == "live"
+        header = await asyncio.to_thread(self._jobs.runs.read_header, job.options.run)
+        return header is None or header.on == "live"
 
     async def _stop_job(self, request: web.Request) -> web.Response:
         self._access.require(request, "drive")
@@ -134,27 +188,3 @@ class JobRequests:
         with self.waiting_for_disk():
             picture = await self._jobs.runs.plot(request.match_info["run"])
         return web.Response(body=picture, content_type="image/png")
-
-
-def _check_length(options: Any) -> None:
-    """Raise `ApiError` if the time is too short or too long for a measurement."""
-    try:
-        plan(options.seconds, getattr(options, "parameters", {}))
-    except ParameterError as error:
-        raise ApiError(400, "bad-arguments", str(error)) from None
-
-
-def _check_parameters(options: Any, controllers: Collection[ControllerInfo]) -> None:
-    """Raise `ApiError` unless each name is that of a parameter, and so no other option."""
-    if not controllers:
-        raise ApiError(503, "no-daemon", "fishd has not answered yet, so no controller is known")
-    names = {
-        field.name
-        for info in controllers
-        if info.name == getattr(options, "controller", None)
-        for field in info.parameters
-    }
-    for name in options.parameters:
-        if name not in names:
-            message = f"{options.controller} has no parameter '{text.quoted(name)}'"
-            raise ApiError(400, "bad-arguments", message)

@@ -16,18 +16,22 @@ from typing import Any, Literal
 
 import msgspec
 from msgspec import Struct
+from msgspec.structs import replace
 
 from fishd.core import files, text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError
+from fishd.core.experiments import PROGRESS_PREFIX, CurvePoint, Form, Plan, Progress
 from fishd.window.children import JobError, spawn
 from fishd.window.curves import read_curve
-from fishd.window.job_options import DRIVING_KINDS, QUEUE, ResumeOptions, list_words
+from fishd.window.forms import Forms
+from fishd.window.job_options import ResumeOptions, list_words, swims
 from fishd.window.runs import Runs
 
 MAX_RUNNING_JOBS = 4
 MAX_REMEMBERED_JOBS = 20
 MAX_LINES = 50
+MAX_POINTS = 200
 MAX_OUTPUT_BYTES = 4 * 2**20
 STOP_TIMEOUT_S = 5.0
 """Time from SIGINT to SIGTERM, and from that to SIGKILL [s]."""
@@ -35,8 +39,6 @@ CLOSE_TIMEOUT_S = 3.0 * STOP_TIMEOUT_S
 """Longest wait for the ends of all jobs [s]."""
 TELL_DELAY_S = 0.2
 """Time for which lines of a job are gathered before pages get them [s]."""
-_RESUMABLE = ("measure", "sweep", "compare")
-"""Kinds of experiments that a page resumes."""
 _FOLDER_KINDS = ("record", "rerun")
 """Kinds of jobs whose option `--folder` is that of all runs."""
 
@@ -55,6 +57,10 @@ class Job(Struct):
     """Time since its start, until its end at most [s]."""
     run: str = ""
     """Name of the folder of an experiment."""
+    plan: Plan | None = None
+    progress: Progress | None = None
+    points: list[CurvePoint] = []
+    """Curve of its results until now."""
     lines: list[str] = []
     result: Any = None
     exit: int | None = None
@@ -62,7 +68,14 @@ class Job(Struct):
     """Whether it ended before it was complete, and can be resumed."""
 
 
+class _Report(Struct):
+    """Line of an experiment about its progress."""
+
+    progress: Progress
+
+
 _decode_job: Callable[[bytes], Job] = decoder(Job)
+_decode_report: Callable[[bytes], _Report] = decoder(_Report)
 
 
 class Jobs:
@@ -95,7 +108,7 @@ class Jobs:
         self._pending: set[str] = set()
         self._count = 0
         self._scratch = scratch
-        self.runs = Runs(runs, scratch)
+        self.runs, self.forms = Runs(runs, scratch), Forms(runs)
         self._folder = runs
         self._starting = asyncio.Lock()
 
@@ -130,11 +143,9 @@ class Jobs:
     def _describe_remains(self, job: Job) -> str:
         """Return what is left of a job that was lost; mark it done or resumable if it is."""
         what = "fishd-window was killed while this ran"
-        if job.kind == QUEUE:
-            return f"{what}, and the fish came to rest; the queue waits for a start"
-        if job.kind in DRIVING_KINDS:
-            self._conclude(job)
-            if job.state == "done":
+        if job.run:
+            if self._conclude(job):
+                job.state = "done"
                 return "fishd-window was killed, but this was complete"
             rests = f"{what}, and the fish came to rest"
             kept = f"what was measured until then is in {job.run}"
@@ -143,18 +154,20 @@ class Jobs:
             return f"{what}; what was recorded until then is among the runs"
         return f"{what}; start it again"
 
-    def _conclude(self, job: Job) -> None:
-        """Find out whether an experiment that has ended is complete, or can be resumed."""
+    def _conclude(self, job: Job) -> bool:
+        """Return whether an experiment that has ended is complete; else it can be resumed.
+
+        A complete one may end with status 1, such as a search that has used up its time.
+        """
         header = self.runs.read_header(job.run) if job.run else None
-        if header is None or header.on != "live" or header.kind not in _RESUMABLE:
-            return
-        if not header.ended:
-            job.resumable = True
-        elif job.state == "lost":
-            job.state = "done"
+        job.resumable = header is not None and not header.ended and job.exit != 0
+        if header is None or not header.ended:
+            return job.exit == 0
+        if job.state == "lost":
             with suppress(files.FileProblem, msgspec.DecodeError):
                 path = self._folder / job.run / "result.json"
                 job.result = decoder(Any)(files.read(path, MAX_OUTPUT_BYTES, "a result"))
+        return True
 
     def _new_id(self) -> str:
         self._count += 1
@@ -162,15 +175,17 @@ class Jobs:
 
     async def start(
         self,
-        kind: str,
+        form: Form | None,
         fish: str,
         endpoint: Iterable[str],
         options: Any,
         device: str,
         check: Callable[[], object],
+        plan: Plan | None = None,
     ) -> Job:
         """Start a job; raise `JobError`.
 
+        form: None for an experiment that is resumed
         fish: name of the fish; endpoint: options of fishctl for it
         device: identifier of the device that starts it
         check: raises `FishdError` if that may no longer start it; the disk may have to wait
@@ -179,44 +194,40 @@ class Jobs:
             if len(self._tasks) >= MAX_RUNNING_JOBS:
                 raise JobError(f"{MAX_RUNNING_JOBS} jobs run already; wait for the end of one")
             # A disk may stall, and an emergency stop must not wait for it.
-            prepared = await asyncio.to_thread(self._prepare, kind, options)
+            job, words = await asyncio.to_thread(self._prepare, form, options, fish, [*endpoint])
             check()
-            return self._start_prepared(*prepared, fish, endpoint, options, device)
+            job.plan = plan
+            return self._start_prepared(job, words, device, is_resumed=form is None)
 
-    def _prepare(self, kind: str, options: Any) -> tuple[str, str, list[str]]:
-        """Return kind, folder and command line of a job, whose folders exist then."""
+    def _prepare(
+        self, form: Form | None, options: Any, fish: str, endpoint: list[str]
+    ) -> tuple[Job, list[str]]:
+        """Return a job whose folders exist then, and the arguments of fishctl."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise JobError(f"{self._folder} cannot be created: {error.strerror}") from None
-        if kind == "resume":
-            return self._resume(options)
-        has_folder = kind in DRIVING_KINDS and kind != QUEUE
-        run = f"{kind}-{datetime.now():%Y%m%d-%H%M%S}" if has_folder else ""
-        return kind, self._unused_run(run) if run else "", list_words(kind, options)
-
-    def _start_prepared(
-        self,
-        kind: str,
-        run: str,
-        words: list[str],
-        fish: str,
-        endpoint: Iterable[str],
-        options: Any,
-        device: str,
-    ) -> Job:
-        is_resumed = isinstance(options, ResumeOptions)
-        if is_resumed:
-            for job in self._jobs.values():
-                if job.run == run and job.resumable:
-                    job.resumable = False
-                    self._tell(job)
-        if kind in ("record", *DRIVING_KINDS):
+        if form is None:
+            return self._resume(options, fish, endpoint)
+        kind = form.kind
+        run = f"{kind}-{datetime.now():%Y%m%d-%H%M%S}" if swims(form, options) else ""
+        words = list_words(form, options)
+        if kind == "record" or getattr(options, "on", "") == "live":
             words += endpoint
         shown = [f"--folder={self._folder}"] if self._show_folder and kind in _FOLDER_KINDS else []
-        name = self._new_id()
-        job = Job(name, kind, fish, ["fishctl", *words, *shown], "running", 0.0, run)
-        words += self._list_hidden_words(job, is_resumed=is_resumed)
+        job = Job(self._new_id(), kind, fish, ["fishctl", *words, *shown], "running", 0.0)
+        job.run = self._unused_run(run) if run else ""
+        if form.is_experiment:
+            words.append(f"--on={options.on}")
+        return job, [*words, *self._list_hidden_words(job), "--json"]
+
+    def _start_prepared(self, job: Job, words: list[str], device: str, *, is_resumed: bool) -> Job:
+        name = job.id
+        if is_resumed:
+            for earlier in self._jobs.values():
+                if earlier.run == job.run and earlier.resumable:
+                    earlier.resumable = False
+                    self._tell(earlier)
         self._jobs[name], self._starts[name] = job, time.monotonic()
         while len(self._jobs) > MAX_REMEMBERED_JOBS:
             ended = next((j.id for j in self._jobs.values() if j.state != "running"), None)
@@ -228,13 +239,18 @@ class Jobs:
         self._tasks[name] = asyncio.create_task(self._run(job, words))
         return job
 
-    def _resume(self, options: ResumeOptions) -> tuple[str, str, list[str]]:
-        """Return kind, folder and command line of an experiment that is resumed."""
+    def _resume(
+        self, options: ResumeOptions, fish: str, endpoint: list[str]
+    ) -> tuple[Job, list[str]]:
+        """Return the job and the arguments of an experiment that is resumed."""
         header = self.runs.read_header(options.run)
-        if header is None or header.kind not in _RESUMABLE or header.on != "live":
-            raise JobError(f"{options.run} is not an experiment that this page can resume")
-        words = [header.kind, "--resume", str(self._folder / options.run)]
-        return header.kind, options.run, words + (["--take"] if options.take else [])
+        if header is None or header.ended:
+            raise JobError(f"{options.run} is not an experiment that can be resumed")
+        words = [*header.kind.split(), "--resume", str(self._folder / options.run)]
+        words += (["--take"] if options.take else []) + (endpoint if header.on == "live" else [])
+        kind = header.kind.partition(" ")[0]
+        job = Job(self._new_id(), kind, fish, ["fishctl", *words], "running", 0.0, options.run)
+        return job, [*words, "--json"]
 
     def _unused_run(self, name: str) -> str:
         """Return the name of a folder that does not exist; two jobs may start in one second."""
@@ -243,16 +259,13 @@ class Jobs:
             name, lambda name: name in runs or os.path.lexists(self._folder / name)
         )
 
-    def _list_hidden_words(self, job: Job, *, is_resumed: bool) -> list[str]:
+    def _list_hidden_words(self, job: Job) -> list[str]:
         """Return the arguments that serve this window only: where a job leaves its results."""
         if job.kind in _FOLDER_KINDS:
-            return [f"--folder={self._folder}", "--json"]
+            return [f"--folder={self._folder}"]
         if job.kind == "simulate":
-            return [f"--record={self._recording_of(job)}", "--json"]
-        if job.kind == QUEUE:
-            return ["--json"]
-        place = [] if is_resumed else ["--on=live", f"--folder={self._folder / job.run}"]
-        return [*place, "--json"]
+            return [f"--record={self._recording_of(job)}"]
+        return [f"--folder={self._folder / job.run}"] if job.run else []
 
     def _recording_of(self, job: Job) -> Path:
         """Return the path of the recording of a simulated fish."""
@@ -306,8 +319,8 @@ class Jobs:
                 curve = await read_curve(self._recording_of(job), self._folder)
                 job.result = {**job.result, "curve": curve}
             stopped = job.id in self._stopping
-            await asyncio.to_thread(self._conclude, job)
-            job.state = "stopped" if stopped else "done" if job.exit == 0 else "failed"
+            is_complete = await asyncio.to_thread(self._conclude, job)
+            job.state = "stopped" if stopped else "done" if is_complete else "failed"
         except (OSError, FishdError) as error:
             job.lines.append(text.describe_error(error))
             job.state = "failed"
@@ -342,11 +355,11 @@ class Jobs:
         rest = b""
         while chunk := await stream.read(4096):
             *lines, rest = (rest + chunk)[-(2**16) :].split(b"\n")
-            job.lines += [text.line(line.decode("utf-8", "replace")) for line in lines]
-            del job.lines[:-MAX_LINES]
+            for line in lines:
+                _take_line(job, line)
             self._tell_later(job)
         if rest:
-            job.lines.append(text.line(rest.decode("utf-8", "replace")))
+            _take_line(job, rest)
 
     def _tell_later(self, job: Job) -> None:
         def tell() -> None:
@@ -356,6 +369,20 @@ class Jobs:
         if job.id not in self._pending:
             self._pending.add(job.id)
             asyncio.get_running_loop().call_later(TELL_DELAY_S, tell)
+
+
+def _take_line(job: Job, line: bytes) -> None:
+    """Add a line of a job: its progress, or a text."""
+    if line.startswith(PROGRESS_PREFIX):
+        with suppress(msgspec.DecodeError):
+            progress, before = _decode_report(line).progress, job.progress
+            job.points += [progress.point] if progress.point else []
+            del job.points[:-MAX_POINTS]
+            estimates = progress.estimates or (before and before.estimates)
+            job.progress = replace(progress, estimates=estimates, point=None)
+            return
+    job.lines.append(text.line(line.decode("utf-8", "replace")))
+    del job.lines[:-MAX_LINES]
 
 
 async def _read_all(stream: asyncio.StreamReader) -> bytes:

@@ -13,7 +13,7 @@ from fishd.window.access import AccessControl
 from fishd.window.answers import ApiError, read_body, success
 from fishd.window.children import call
 from fishd.window.fish_link import FishLink
-from fishd.window.job_options import DRIVING_KINDS, QUEUE, list_words
+from fishd.window.job_options import QUEUE, list_words, swims
 from fishd.window.job_requests import JobRequest, JobRequests
 from fishd.window.pages import Pages
 
@@ -75,7 +75,7 @@ class QueueRequests:
         change = await read_body(request, QueueChange)
         with self._jobs.waiting_for_disk():
             if change.op == "add":
-                words = self._list_words(link, change)
+                words = await self._list_words(link, change)
                 async with self._adding:  # one process at a time
                     self._access.require(request, "drive")
                     await call(words, self._jobs.folder)
@@ -89,10 +89,14 @@ class QueueRequests:
             change.apply(file)
         return file.view()
 
-    def _list_words(self, link: FishLink, change: QueueChange) -> list[str]:
+    async def _list_words(self, link: FishLink, change: QueueChange) -> list[str]:
         """Return the arguments of fishctl that check an experiment and add it to the queue."""
-        if change.kind not in DRIVING_KINDS - {"resume", QUEUE}:
+        body = JobRequest(link.name, change.kind, change.options)
+        form = None
+        if change.kind not in ("resume", QUEUE.kind):
+            form, _, options = await self._jobs.check_job(body)
+        if form is None or not swims(form, options):
             raise ApiError(400, "unknown-kind", f"a queue takes no '{text.quoted(change.kind)}'")
-        _, options = self._jobs.check_job(JobRequest(link.name, change.kind, change.options))
+        words, on = list_words(form, options), f"--on={options.on}"
         place = [f"--repeat={change.repeat}", *link.endpoint_options, "--json"]
-        return ["queue", "add", *place, "--", *list_words(change.kind, options)]
+        return ["queue", "add", *place, "--", *words, *([] if "--on" in words else [on])]

@@ -83,7 +83,8 @@ class Runs:
         check_name(name)
         try:
             with suppress(files.NoFile):
-                return await asyncio.to_thread(open_run_picture, self.folder, name)
+                if not name.endswith((".mcap", ".part")):
+                    return await asyncio.to_thread(open_run_picture, self.folder, name)
             return await self._draw(name)
         except files.FileProblem as problem:
             raise JobError(str(problem)) from None
@@ -142,7 +143,8 @@ def _is_empty(folder: Path) -> bool:
 
 def _read_stamp(folder: Path, name: str) -> list[tuple[str, int, int]]:
     """Return what changes with the files of a run: name, size and time of each."""
-    paths = [*folder.glob(f"{glob.escape(name)}.mcap*"), *(folder / name).glob("*")]
+    stem = name.removesuffix(".part").removesuffix(".mcap")
+    paths = [*folder.glob(f"{glob.escape(stem)}.*"), *(folder / name).glob("*")]
     with suppress(OSError):
         stats = [(path.name, path.stat()) for path in sorted(paths)]
         return [(name, status.st_size, status.st_mtime_ns) for name, status in stats]

@@ -116,6 +116,9 @@ class Film:
     lens: float = 0.0
     """Relative displacement at the corners."""
     tilt: float = 0.0
+    """Angle of the camera against the plane of the tail, towards the tip [rad]."""
+    aspect: float = 1.0
+    """Height of a pixel relative to its width."""
     bend: float = 0.0
     """Change of direction along the fin at its highest speed [rad]."""
     top_rate: float = 5.3
@@ -251,11 +254,12 @@ class FilmedTail:
             c, s = knock.zoom * math.cos(knock.turn), knock.zoom * math.sin(knock.turn)
             offset = offset @ np.array([[c, s], [-s, c]]) + film.width * np.array(knock.shift)
         if film.tilt:
-            offset = offset / (1.0 + math.tan(film.tilt) * offset[:, :1] / film.width)
+            depth = 1.0 + math.sin(film.tilt) * offset[:, :1] / film.width
+            offset = offset * (math.cos(film.tilt), 1.0) / depth
         if film.lens:
             radius = np.linalg.norm(offset, axis=1, keepdims=True) / math.hypot(*self._centre)
             offset = offset * (1.0 + film.lens * radius**2)
-        seen = self._centre + offset
+        seen = self._centre + offset / (1.0, film.aspect)
         if film.waves:
             seen = seen + self._displacement(seen, time)
         return np.asarray(seen)
@@ -313,7 +317,7 @@ class FilmedTail:
                 back + 1.1 * half * across,
             ]
         )
-        if film.lens or film.tilt:
+        if film.lens or film.tilt or film.aspect != 1.0:
             corners = (self._project(corners / SAMPLES - 0.5, -1.0) + 0.5) * SAMPLES
         cv2.fillPoly(mask, [np.rint(corners).astype(np.int32)], 255)
         covered = cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32) / 255

@@ -8,6 +8,7 @@ import numpy as np
 from fishd.camera.tail.beats import find_maxima
 from fishd.camera.tail.learned import Learned
 from fishd.camera.tail.learner import Learner
+from fishd.camera.tail.lens import Lens
 from fishd.camera.tail.meter import TailMeter
 from fishd.core.tail_reading import TailReading
 from rigs.filmed_tail import Film, FilmedTail
@@ -30,16 +31,32 @@ CASES = {
     ),
     BESIDE: Film(lens=-0.12, tilt=0.08),
     "lens, tilt": Film(lens=-0.12, tilt=0.08, root=(0.08, 0.0)),
+    "tilt of 0.2 rad": Film(tilt=-0.2, root=(0.08, 0.0)),
+    "pixels 5 % too high": Film(aspect=1.05),
     BENDING: Film(bend=0.03),
 }  # fmt: skip
 ASKED: dict[str, tuple[float | None, float | None]] = dict(
     zip(
         CASES,
-        [(2, 1), (2, 1), (5, 2), (None, 2), (20, 3), (None, 2.5), (None, 2.5), (6, None)],
+        [
+            (2, 1),
+            (2, 1),
+            (5, 2),
+            (None, 2),
+            (20, 3),
+            *2 * [(None, 2.5)],
+            *2 * [(None, None)],
+            (6, None),
+        ],
         strict=True,
     )
 )
 """Largest rms error of the fin angle after its zero [mrad] and error of its maximum [%]."""
+
+BENT = [case for case, film in CASES.items() if film.lens or film.tilt or film.aspect != 1.0]
+"""Films whose view needs a calibration."""
+ASKED_CALIBRATED = 1.0
+"""Largest error of the maximum with it [%]."""
 
 
 class Errors(NamedTuple):
@@ -60,9 +77,9 @@ class Errors(NamedTuple):
 
 
 @cache
-def learn(film: Film) -> Learned:
+def learn(film: Film, lens: Lens | None = None) -> Learned:
     """Return what the first five seconds of a film show."""
-    learner = Learner()
+    learner = Learner(lens)
     for shot in FilmedTail(film).shots(0.0, 5.0):
         learner.add(*shot)
     return learner.finish()

@@ -174,11 +174,12 @@ async def test_an_emergency_stop_waits_for_no_folder_of_runs(
         here = Target("127.0.0.1", window.port)
         paths = ["/api/runs", "/api/runs/any/plot.png", "/api/trash", "/api/results?run=any"]
         paths += ["/api/runs/any/download/all.zip", "/api/runs/any/download/rows.csv"]
+        paths += ["/api/fish/fish/queue"]
         asking = [asyncio.ensure_future(here.exchange(here.request("GET", path))) for path in paths]
         for _ in range(3):
             await asyncio.sleep(0.1)
             assert await press(here) is not None
-        assert not asking[0].done()
+        assert not any(task.done() for task in asking)
         for task in asking:
             task.cancel()
 

@@ -1,13 +1,15 @@
 """Errors of the fin angle that is measured in pictures, on films whose fin angle is known.
 
-Each film of the tests is learned from its first 5 s and measured in the next 7 s. The worst of all
-seeds is shown, and after a slash the goal. With --faults, a fault begins at 6 s instead.
+Each film of the tests is learned from its first 5 s and measured in the next 7 s, and some of them
+again with a calibration by a board. The worst of all seeds is shown, and after a slash the goal.
+With --faults, a fault begins at 6 s instead.
 """
 
 import sys
 import time
 import tracemalloc
 from argparse import Namespace
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -17,8 +19,9 @@ from common.report import DOCS, JOBS, Options, Report, run_cases, table
 
 sys.path.append(str(DOCS.parent / "tests"))
 from rigs.faulty_films import FAULTS, FILMS, fail
+from rigs.filmed_board import calibrate
 from rigs.filmed_tail import FilmedTail
-from rigs.measured_tail import ASKED, CASES, find_errors, learn
+from rigs.measured_tail import ASKED, ASKED_CALIBRATED, BENT, CASES, find_errors, learn
 
 from fishd.camera.tail.learner import Learner
 from fishd.camera.tail.meter import TailMeter
@@ -35,30 +38,42 @@ def measure(options: Namespace) -> Report:
     """Return the table."""
     if options.faults:
         return _measure_faults(options)
-    films = [(case, seed) for case in CASES for seed in range(options.seeds)]
+    cases = [(case, False) for case in CASES] + [(case, True) for case in BENT]
+    films = [(*case, seed) for case in cases for seed in range(options.seeds)]
     results = dict(zip(films, run_cases(_measure_film, films, options.jobs), strict=True))
-    rows = []
-    for case, asked in ASKED.items():
-        each = np.array([results[case, seed] for seed in range(options.seeds)])
-        cells = [
+
+    def cells(case: str, calibrated: bool, asked: Sequence[float | None]) -> list[str]:
+        each = np.array([results[case, calibrated, seed] for seed in range(options.seeds)])
+        return [
             f"{worst:.1f}" + (f"/{limit:g}" if limit is not None else "")
             for worst, limit in zip(np.abs(each[:, :2]).max(axis=0), asked, strict=True)
         ]
-        rows.append([case, *cells])
+
+    rows = [
+        [
+            case,
+            *cells(case, False, asked),
+            *(cells(case, True, (None, ASKED_CALIBRATED)) if case in BENT else ["", ""]),
+        ]
+        for case, asked in ASKED.items()
+    ]
     every = np.array(list(results.values()))
-    is_bent = np.array([CASES[case].lens != 0.0 for case, _ in results])
+    is_bent = np.array([case in BENT and not calibrated for case, calibrated, _ in results])
     known, *covered = (
         100.0 * each.min() for each in (every[:, 2], every[~is_bent, 3], every[is_bent, 3])
     )
     about = (
         f"Of the pictures, at least {known:.0f} % are measured, {covered[0]:.0f} % of them within "
-        f"their ± (with a lens, {covered[1]:.0f} %). One takes {every[:, 4].max():.1f} ms, and "
-        f"learning {every[:, 5].max():.1f} s and {_find_memory() / 1e6:.0f} MB."
+        f"their ± (without a calibration that is needed, {covered[1]:.0f} %). One takes "
+        f"{every[:, 4].max():.1f} ms, and learning {every[:, 5].max():.1f} s and "
+        f"{_find_memory() / 1e6:.0f} MB."
     )
-    figures = {f"{case}, seed {seed}": result for (case, seed), result in results.items()}
-    return Report(
-        {"bench fin_angle": f"{table('film | rms [mrad] | α_max [%]', rows)}\n\n{about}"}, figures
-    )
+    figures = {
+        f"{case}{', calibrated' * calibrated}, seed {seed}": result
+        for (case, calibrated, seed), result in results.items()
+    }
+    head = "film | rms [mrad] | α_max [%] | calibrated: rms | α_max"
+    return Report({"bench fin_angle": f"{table(head, rows)}\n\n{about}"}, figures)
 
 
 def _measure_faults(options: Namespace) -> Report:
@@ -90,11 +105,11 @@ def _measure_outcomes(case: tuple[str, int]) -> dict[str, tuple[float, float, fl
     return {fault: tuple(fail(learned, film, fault, case[1])) for fault in FAULTS}  # type: ignore[misc]
 
 
-def _measure_film(case: tuple[str, int]) -> list[float]:
+def _measure_film(case: tuple[str, bool, int]) -> list[float]:
     """Return the errors of a film [mrad, %], two fractions, and the cost [ms, s]."""
     cv2.setNumThreads(1)
-    film = replace(CASES[case[0]], seed=case[1])
-    camera, learner = FilmedTail(film), Learner()
+    film = replace(CASES[case[0]], seed=case[2])
+    camera, learner = FilmedTail(film), Learner(calibrate(film) if case[1] else None)
     for shot in camera.shots(0.0, 5.0):
         learner.add(*shot)
     begin = time.process_time()

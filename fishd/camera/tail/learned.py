@@ -10,7 +10,8 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from fishd.camera.tail.profile import STATIONS
+from fishd.camera.tail.lens import Lens
+from fishd.camera.tail.profile import STATIONS, Array, Pose
 from fishd.core import files, text
 from fishd.core.camera_frames import Pixels
 from fishd.core.errors import FishdError
@@ -30,7 +31,10 @@ class CannotUse(FishdError, ValueError):
 
 
 class Learned(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Tail, ground and camera; lengths are in pixels of the turned whole picture."""
+    """Tail, ground and camera; lengths are in pixels of the turned whole picture.
+
+    Angles, `shape` and its errors, and `pixels_per_mm` belong to the plane of the tail.
+    """
 
     date: Annotated[str, note("Date and time of learning, ISO 8601.")]
     size: Annotated[tuple[int, int], unit("px", "Width and height of the picture.")]
@@ -89,6 +93,9 @@ class Learned(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     pixels_per_mm: Annotated[
         float | None, unit("px/mm", "Scale at the depth of the tail; null if unknown.")
     ] = None
+    lens: Annotated[
+        Lens | None, note("Calibration with which it was learned; null without one.")
+    ] = None
 
     @property
     def is_light(self) -> bool:
@@ -109,7 +116,29 @@ class Learned(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     def with_length(self, length_mm: float | None) -> "Learned":
         """Return this with the scale for a length of the tail [mm]; unchanged for None."""
-        return replace(self, pixels_per_mm=self.length / length_mm) if length_mm else self
+        if not length_mm:
+            return self
+        steps = np.diff(np.array(self.shape[0]), axis=1)  # at α = 0
+        length = float(np.hypot(*steps).sum()) * STATIONS / (STATIONS - 1)
+        return replace(self, pixels_per_mm=length / length_mm)
+
+    def to_axis(self, places: Array) -> Array:
+        """Return coordinates along and across the axis, in the plane of the tail [px].
+
+        places: columns and rows of a picture, shape (…, 2) [px]
+        """
+        pose = Pose(self.root, self.direction)
+        if self.lens is None:
+            return pose.to_axis(places)
+        return pose.in_plane(self.lens).to_axis(self.lens.to_plane(places))
+
+    def check_lens(self, lens: Lens | None) -> None:
+        """Raise `CannotUse` if the tail was learned with another calibration, or without one."""
+        if self.lens != lens:
+            raise CannotUse(
+                "the tail was learned without this calibration of the lens, or with another: learn "
+                "again"
+            )
 
     def check_size(self, width: int, height: int) -> None:
         """Raise `CannotUse` for pictures of another size."""

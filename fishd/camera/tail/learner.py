@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from fishd.camera.axis import NoMotion, find_motion
 from fishd.camera.tail.ground import Floats, Ground, Mask, shrink
 from fishd.camera.tail.learned import ORDER, Learned
+from fishd.camera.tail.lens import Lens
 from fishd.camera.tail.profile import STATIONS, Array, Pose, Trace, Tracer, fit_line
 from fishd.camera.tail.scene import Scene
 from fishd.camera.tail.shape import Shape
@@ -64,14 +65,18 @@ class CannotLearn(FishdError, ValueError):
 class Learner:
     """Collector of pictures, from which `finish` learns."""
 
-    def __init__(self) -> None:
+    def __init__(self, lens: Lens | None = None) -> None:
+        """lens: calibration of the camera; None without one"""
+        self._lens = lens
         self._pictures: list[tuple[float, Pixels]] = []
         self._size = (0, 0)
         self._seen = 0
         self._random = random.Random(0)
 
     def add(self, time: float, picture: Pixels) -> None:
-        """Take a whole turned picture of a time [s]; raise `CannotLearn` if its size changes.
+        """Take a whole turned picture of a time [s].
+
+        Raise `CannotLearn` if its size changes, and `CannotUseLens` if it is not that of the lens.
 
         Of many pictures, a random choice is kept, at half their size or 400 px wide.
         """
@@ -81,6 +86,8 @@ class Learner:
                 f"the pictures change from {self._size[0]} × {self._size[1]} to {size[0]} × "
                 f"{size[1]} pixels: learn from pictures of one size"
             )
+        if self._lens:
+            self._lens.check(size, self._lens.rotate)
         self._size = size
         self._seen += 1
         place = len(self._pictures)
@@ -104,7 +111,7 @@ class Learner:
         times = np.array([time for time, _ in self._pictures])
         pictures = [picture for _, picture in self._pictures]
         scene = _Scene(pictures, self._size[0] / pictures[0].shape[1])
-        traces = _trace_all(scene, pictures)
+        traces = _trace_all(scene, pictures, self._lens)
         return self._summarise(scene, times, traces, pictures)
 
     def _summarise(
@@ -126,7 +133,7 @@ class Learner:
         swing = points[..., 1].std(axis=0)
         if np.count_nonzero(weight.min(axis=1)) < _MIN_WHOLE or swing[0] > swing[-1]:
             raise CannotLearn(_NO_SHAPE)
-        scene.check_edges(points)
+        scene.check_edges(np.stack([trace.places for trace in seen]))
         fin = _find_fin(points, weight)
         first, last = _stations(fin)
         lines = [
@@ -178,6 +185,8 @@ class Learner:
             turn_error=float(np.quantile(differences[:, 1], 0.95)),
             covariance=tuple(tuple(row.tolist()) for row in shape.covariance * scale**2),
             pose_error=_find_pose_error(scene, pictures),
+            lens=self._lens,
+            pixels_per_mm=self._lens.pixels_per_mm if self._lens else None,
         )
 
 
@@ -277,9 +286,8 @@ class _Scene:
         self.pose = self.pose._replace(root=(float(x), float(y)))
         self.ground = Ground(self.background, self.size, self.tail_level, self.swept)
 
-    def check_edges(self, points: Array) -> None:
+    def check_edges(self, places: Array) -> None:
         """Raise `CannotLearn` if the tail leaves the picture."""
-        places = self.pose.to_picture(points)
         if side := cut_off_side(places.reshape(-1, 2), self.size, 0.5 * _EDGE_PX):
             raise CannotLearn(
                 f"the tail leaves the picture at the {side}: raise the camera or let the fish "
@@ -329,7 +337,7 @@ def _to_levels(picture: Floats) -> Pixels:
     return np.asarray(np.clip(picture + 0.5, 0.0, 255.0), np.float32).astype(np.uint8)
 
 
-def _trace_all(scene: _Scene, pictures: list[Pixels]) -> list[Trace | None]:
+def _trace_all(scene: _Scene, pictures: list[Pixels], lens: Lens | None) -> list[Trace | None]:
     """Return the midlines, after the length of the tail has been found in some pictures."""
     tracer = Tracer(scene.ground, scene.pose, scene.half_width)
     some = [
@@ -339,7 +347,9 @@ def _trace_all(scene: _Scene, pictures: list[Pixels]) -> list[Trace | None]:
         raise CannotLearn(_NOTHING_SWINGS)
     scene.length = float(np.quantile([trace.length for trace in some], 0.6))
     scene.half = np.median([trace.half for trace in some], axis=0)
-    tracer = Tracer(scene.ground, scene.pose, scene.half_width, scene.length, scene.half)
+    tracer = Tracer(
+        scene.ground, scene.pose, scene.half_width, scene.length, scene.half, lens, scene.factor
+    )
     return [tracer.trace(picture) for picture in pictures]
 
 

@@ -111,8 +111,9 @@ class TailMeter:
         self._half = np.array(learned.half_thickness)
         self._pose = Pose(learned.root, learned.direction)
         self._tracer = Tracer(
-            self._ground, self._pose, float(self._half.max()), learned.length, self._half
-        )
+            self._ground, self._pose, float(self._half.max()), learned.length, self._half,
+            learned.lens,
+        )  # fmt: skip
         self._shape = Shape(np.array(learned.shape), np.array(learned.covariance))
         self._scene = Scene(self._ground)
         first, last = learned.fin
@@ -176,7 +177,7 @@ class TailMeter:
         trace = self._tracer.trace_cover(picture, light, cover)
         if trace is None:
             return TailReading(time=time, zero=zero, reason="no tail where it was learned")
-        places = self._pose.to_picture(trace.points)
+        places = trace.places
         middle = places[self._fin].mean(axis=0)
         height, width = picture.shape
         time += row_time * (float(middle[1]) / max(height - 1, 1) - 0.5)

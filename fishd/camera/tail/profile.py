@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fishd.camera.tail.ground import Floats, Ground, shrink
+from fishd.camera.tail.lens import Lens
 from fishd.core.camera_frames import Pixels
 
 STATIONS = 32
@@ -53,12 +54,20 @@ class Pose(NamedTuple):
         c, s = math.cos(self.direction), math.sin(self.direction)
         return np.asarray((points - self.root) @ np.array([[c, -s], [s, c]]))
 
+    def in_plane(self, lens: Lens, factor: float = 1.0) -> "Pose":
+        """Return root and axis in the plane of the tail; factor: as for `Lens.to_plane`."""
+        axis = np.array([[0.0, 0.0], [10.0, 0.0]])
+        root, ahead = lens.to_plane(self.to_picture(axis), factor).tolist()
+        return Pose((root[0], root[1]), math.atan2(ahead[1] - root[1], ahead[0] - root[0]))
+
 
 class Trace(NamedTuple):
     """Midline of the tail in one picture."""
 
+    places: Array
+    """Columns and rows of the stations in the picture, shape (STATIONS, 2) [px]."""
     points: Array
-    """Places along and across the axis from the root, shape (STATIONS, 2) [px]."""
+    """Places along and across the axis from the root, in the plane of the tail [px]."""
     weight: Array
     """1 where the tail was seen at a station, 0 where not."""
     half: Array
@@ -81,12 +90,18 @@ class Tracer:
         half_width: float,
         length: float | None = None,
         half: Array | None = None,
+        lens: Lens | None = None,
+        factor: float = 1.0,
     ) -> None:
         """
         half_width: largest half of the tail's thickness [px]
         length: length of the tail [px]; None: that seen in each picture
         half: half of the tail's thickness at each station [px]
+        lens: maps the middles to the plane of the tail; None: it is that of the picture
+        factor: as for `Lens.to_plane`
         """
+        self._lens, self._factor = lens, factor
+        self._plane = pose.in_plane(lens, factor) if lens else pose
         self._ground, self.pose, self.length = ground, pose, length
         width, height = ground.size
         scale = ground.scale
@@ -193,8 +208,13 @@ class Tracer:
         near = np.abs(across[station]) <= self._half[:, None]
         bright = grey.reshape(STATIONS, _LINES, -1).max(axis=1) >= SATURATED
         glaring = (bright & near).sum(axis=1) > 0.15 * near.sum(axis=1)
+        points = middle[station] + shift[:, None] * normal[station]
+        places = self.pose.to_picture(points)
+        if self._lens:
+            points = self._plane.to_axis(self._lens.to_plane(places, self._factor))
         return Trace(
-            middle[station] + shift[:, None] * normal[station],
+            places,
+            points,
             ((half > _MIN_MASS * self._half) | (self.length is None)).astype(np.float64),
             half,
             glaring,

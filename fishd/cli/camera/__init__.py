@@ -13,6 +13,7 @@ VERBS = {
     },
     "Set up": {
         "align": Verb("camera.align", "align", "Find the axis of motion, and how to turn it."),
+        "lens": Verb("camera.lens", "lens", "Calibrate lens and view, with a printed board."),
         "latency": Verb("camera.latency", "latency", "Measure the delay of its pictures."),
     },
 }

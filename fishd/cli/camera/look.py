@@ -72,6 +72,8 @@ def status_rows(state: "CameraState") -> list[tuple[str, str]]:
     pairs.append(("frames", f"{state.width} x {state.height} px{source}"))
     if state.tail != "off":
         pairs.append(("fin angle", _describe_tail(state)))
+    if state.lens:
+        pairs.append(("lens", state.lens))
     lost = []
     if state.dropped_frames:
         lost.append(f"{format_count(state.dropped_frames, 'frame')} that no client got")

@@ -150,12 +150,13 @@ def _print_learned(state: "CameraState", as_json: bool) -> None:
         print_json({"learned": state.tail_learned, "zero_ci95": zero_ci95})
         return
     size = f"{state.picture_width} x {state.picture_height} px"
-    echo_rows(
-        [
-            ("learned", f"{state.tail_learned}, from pictures of {size}"),
-            ("zero", f"± {zero_ci95 * 1e3:.1f} mrad"),
-        ]
-    )
+    rows = [
+        ("learned", f"{state.tail_learned}, from pictures of {size}"),
+        ("zero", f"± {zero_ci95 * 1e3:.1f} mrad"),
+    ]
+    if state.lens:
+        rows.append(("lens", f"{state.lens}; if the camera has moved, calibrate again"))
+    echo_rows(rows)
     if zero_ci95 > MAX_ZERO_CI95_RAD:
         echo("the fish was not seen at rest: end its swim, wait, and learn again for a better zero")
     echo("the camera measures from now on: fishctl camera measure shows it")

@@ -25,6 +25,7 @@ def measure_free(path: Path, options: VideoOptions, *, as_json: bool) -> int:
 
     for name, value in (
         ("--learned", options.learned),
+        ("--lens", options.lens),
         ("--with", options.recording),
         ("--plot", options.picture),
     ):

@@ -24,8 +24,9 @@ from fishd.core.process.interruption import raise_on_first_signal
 if TYPE_CHECKING:
     from fishd.camera.latency import Force
     from fishd.camera.tail.learned import Learned
+    from fishd.camera.tail.lens import Turn
     from fishd.camera.tail_table import TailTable
-    from fishd.camera.video import Turn, Video
+    from fishd.camera.video import Video
     from fishd.lab.fin_angle_figure import Example
     from fishd.lab.video_clock import ClockOffset
 
@@ -43,6 +44,7 @@ class VideoOptions(NamedTuple):
     rate: float | None
     turn: "Turn | None"
     learned: Path | None
+    lens: Path | None
     recording: str | None
     length_mm: float | None
     target: Path | None
@@ -61,6 +63,7 @@ _NAMES = (
     "--rate",
     "--rotate",
     "--learned",
+    "--lens",
     "--with",
     "--length",
     "--to",
@@ -114,6 +117,7 @@ def video_options(function: F) -> F:
             "--learned",
             about="tail that was learned before, by fishd-camera or with --learn, which writes it.",
         ),
+        file_option("--lens", about="calibration of its lens, by 'fishctl camera lens'."),
         click.option(
             "--rotate",
             "turn",
@@ -225,16 +229,25 @@ def _find_learned(
 ) -> "Learned":
     """Return the tail of the file, of the unfinished table, or learned from the video."""
     from fishd.camera.tail.learned import Learned
+    from fishd.camera.tail.lens import Lens
     from fishd.camera.video import learn as learn_from
 
+    lens = Lens.load(options.lens) if options.lens else None
+    if lens:
+        lens.check(video.size, options.turn or 0)
     if options.learned and not learn:
         learned = Learned.load(options.learned)
         learned.check_size(*video.size)
+        if lens:
+            learned.check_lens(lens)
+        if learned.lens:
+            learned.lens.check(video.size, options.turn or 0)
         return learned.with_length(options.length_mm)
     if table.learned:
+        table.learned.check_lens(lens)
         return table.learned
     with show_waiting("learning the tail"):
-        learned, begin = learn_from(video)
+        learned, begin = learn_from(video, lens)
     learned = learned.with_length(options.length_mm)
     echo(
         f"fishctl: the tail is learned from {begin:.0f} s of the video on, its zero is known to "

@@ -11,12 +11,13 @@ import click
 from msgspec import to_builtins
 from msgspec.structs import replace
 
-from fishd.cli import dry_run
 from fishd.cli.config import config_option, set_option
 from fishd.cli.experiment import Ending
 from fishd.cli.experiment_options import (
     On,
     default_on,
+    dry_run_option,
+    end_dry_run,
     kept_arguments,
     on_option,
     restore_arguments,
@@ -31,10 +32,11 @@ from fishd.cli.options import (
     verb_lease,
 )
 from fishd.cli.output import echo, print_json
-from fishd.cli.progress import show_progress
+from fishd.cli.progress import report_progress, show_progress
 from fishd.config import adopt, load
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import ConfigError
+from fishd.core.experiments import Plan, Progress
 from fishd.core.process.interruption import Interrupted, on_signal
 
 if TYPE_CHECKING:
@@ -116,6 +118,7 @@ class _Training(click.Command):
 )
 @endpoint_option
 @take_option
+@dry_run_option
 @click.option(
     "--agent",
     metavar="ADDRESS",
@@ -150,6 +153,7 @@ def ppo(
     resume: Path | None,
     parent: Path | None,
     endpoint: str | None,
+    is_dry: bool,
     agent: str | None,
     seeds: int | None,
     jobs: int | None,
@@ -197,7 +201,11 @@ def ppo(
     changed = {name: value for name, value in given_settings.items() if value is not None}
     job = replace(job, agent=agent, settings=replace(job.settings, **changed))
     job = _add_camera(job, camera_config or camera)
-    dry_run.end_of_check()
+    if is_dry:
+        job.check()
+        steps = job.last_step()
+        seconds = steps * job.config.tick if job.on == "live" else None
+        end_dry_run(Plan(steps * (seeds or 1), "steps", seconds), as_json)
     if seeds is not None:
         job = replace(job, resume=resumes_seeds)
         status, draw = _train_seeds(job, seeds, jobs, cluster, as_json), figure.draw_seeds
@@ -290,12 +298,15 @@ def _add_camera(job: "Job", camera: str | None) -> "Job":
 
 
 def _train(job: "Job", as_json: bool) -> int:
-    from fishd.learning.train.progress import ShownDisplay
+    from fishd.learning.train.progress import ShownDisplay, list_estimates
     from fishd.learning.train.training import train
 
     stopping = threading.Event()
     with on_signal(stopping.set), show_progress(job.last_step(), "steps", err=as_json) as progress:
         outcome = train(job, ShownDisplay(progress), stopping.is_set)
+    if best := outcome.best_evaluation:
+        headline = f"To write it to a file: fishctl learn export {outcome.folder.name}"
+        report_progress(Progress(1.0, 0.0, headline, list_estimates(best)))
     if as_json:
         print_json(outcome)
     return print_outcome(outcome, job, as_json)

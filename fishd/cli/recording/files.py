@@ -25,6 +25,7 @@ from fishd.recording.folder import (
     list_recordings,
     runs_folder,
 )
+from fishd.recording.part_file import SUFFIX
 from fishd.recording.reader import RECOVERED
 
 folder_option = click.option(
@@ -135,7 +136,8 @@ def plot(
 
     RUN is a path, a name in the folder of recordings, or 'latest'. Of an experiment, its last
     recording is drawn; of a measurement, its drift and its thrust; of a training, its progress.
-    Several runs are drawn over each other, each from the beginning of its swim.
+    Several runs are drawn over each other, each from the beginning of its swim; one without a
+    recording is left out.
     """
     from fishd.lab.run_figure import draw_run, draw_runs
     from fishd.lab.run_traces import traces
@@ -143,30 +145,39 @@ def plot(
     experiments = [_find_experiment(run, folder) for run in runs]
     if any(experiments) and (begin or end is not None):
         raise click.UsageError("--from and --until are for a recording, not an experiment")
-    experiment = experiments[0] if len(runs) == 1 else None
-    recordings = (
-        []
-        if experiment
-        else [_open_plotted(*pair, folder) for pair in zip(runs, experiments, strict=True)]
-    )
-    last = math.inf if end is None else end
-    drawn = [traces(recording, begin, last) for recording in recordings]
-    path = target or experiment or recordings[0].path.parent
-    if path.is_dir():
-        stem = experiment.name if experiment else recordings[0].name
-        path = path / f"{stem}{'-compared' if len(runs) > 1 else ''}.png"
-    check_new_files([path], replace=force)
-    if experiment:
+    if len(runs) == 1 and (experiment := experiments[0]):
+        path = _picture_path(target or experiment, experiment.name, force)
         _draw_experiment(experiment, path)
-    elif len(drawn) == 1:
-        draw_run(drawn[0], path)
+        print_paths([path], as_json)
+        return
+    pairs = list(zip(runs, experiments, strict=True))
+    recordings = {
+        experiment.name if experiment else run: _open_plotted(run, experiment, folder)
+        for run, experiment in pairs
+    }
+    left_out = [name for name, recording in recordings.items() if recording is None]
+    kept = {name: recording for name, recording in recordings.items() if recording}
+    if not kept:
+        raise FishdError(f"nothing can be drawn: no recording in {', '.join(left_out)}")
+    last = math.inf if end is None else end
+    drawn = {name: traces(recording, begin, last) for name, recording in kept.items()}
+    first = next(iter(kept.values()))
+    name = first.name if len(runs) == 1 else f"{first.name}-compared"
+    path = _picture_path(target or first.path.parent, name, force)
+    if len(runs) == 1:
+        draw_run(drawn[runs[0]], path)
     else:
-        names = [
-            found.name if found else r.name
-            for found, r in zip(experiments, recordings, strict=True)
-        ]
-        draw_runs(dict(zip(names, drawn, strict=True)), path)
+        draw_runs(
+            {n.rpartition("/")[2].removesuffix(SUFFIX): t for n, t in drawn.items()}, left_out, path
+        )
     print_paths([path], as_json)
+
+
+def _picture_path(target: Path, name: str, force: bool) -> Path:
+    """Return the file of a picture: the target, or this name in that folder."""
+    path = target / f"{name}.png" if target.is_dir() else target
+    check_new_files([path], replace=force)
+    return path
 
 
 def _find_experiment(run: str, folder: Path | None) -> Path | None:
@@ -175,13 +186,12 @@ def _find_experiment(run: str, folder: Path | None) -> Path | None:
     return path if (path / EXPERIMENT).is_file() else None
 
 
-def _open_plotted(run: str, experiment: Path | None, folder: Path | None) -> Run:
-    """Open a recording, or the last one of an experiment; raise `FishdError`."""
+def _open_plotted(run: str, experiment: Path | None, folder: Path | None) -> Run | None:
+    """Open a recording, or the last one of an experiment; None for one without a recording."""
     if experiment is None:
         return open_recording(run, folder)
-    if recordings := list_recordings(experiment):
-        return open_run(recordings[-1])
-    raise FishdError(f"{experiment}: nothing can be drawn: it contains no recording")
+    recordings = list_recordings(experiment)
+    return open_run(recordings[-1]) if recordings else None
 
 
 def _draw_experiment(folder: Path, path: Path) -> None:

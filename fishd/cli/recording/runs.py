@@ -102,7 +102,7 @@ class _ExperimentSummary(Struct):
     duration: float | None = None
     """Tank time of the result, else time from begin to end; None where neither is known [s]."""
     about: dict[str, str] = {}
-    """Its note, if it has one."""
+    """Note of the experiment, if it has one."""
 
     @classmethod
     def read(cls, path: Path, header: "Header | ConfigError") -> "_ExperimentSummary":

@@ -53,20 +53,15 @@ def rename(run: str, name: str, folder: Path | None, as_json: bool) -> None:
 
 @click.command()
 @click.argument("runs", nargs=-1, required=True)
-@click.option("--forever", is_flag=True, help="Delete at once what cannot be restored then.")
 @_options
-def delete(runs: tuple[str, ...], forever: bool, folder: Path | None, as_json: bool) -> None:
+def delete(runs: tuple[str, ...], folder: Path | None, as_json: bool) -> None:
     """Move runs into the trash, from which 'fishctl runs restore' brings them back.
 
     They stay there for 30 days, and take space on the disk until then.
     """
     place = _find_folder(folder)
-    deleted = []
-    for path in [stored_runs.find_stored_run(run, place) for run in runs]:
-        if forever:
-            stored_runs.delete_forever(path)
-        else:
-            deleted.append(stored_runs.delete_run(path))
+    paths = [stored_runs.find_stored_run(run, place) for run in runs]
+    deleted = list(map(stored_runs.delete_run, paths))
     if as_json:
         print_json(deleted)
     for run in () if as_json else deleted:

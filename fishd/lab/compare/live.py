@@ -1,7 +1,7 @@
 """Comparison of policies and controllers on a real fish, by measured thrust with intervals."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -29,13 +29,16 @@ class LiveComparison:
         self._session = session
         self._measured: list[list[ThrustMeasurement]] = [[] for _ in self.contestants]
 
-    def swim(self, seconds: float = 60.0, runs: int = 1) -> None:
+    def swim(
+        self, seconds: float = 60.0, runs: int = 1, done: Callable[[], None] = lambda: None
+    ) -> None:
         """Swim and rest each contestant in turn, for `seconds` in each run.
 
         With several runs, all contestants swim once, then all again, so that slow changes affect
         all of them equally. A contestant that fails is left out of later runs; its earlier runs
         count.
 
+        done: called after each run
         Raises `ParameterError` for a time that is too short, `Disturbed` and `NoDaemon`.
         """
         self.check(seconds)
@@ -56,6 +59,7 @@ class LiveComparison:
                 excluded.add(index)
                 continue
             self._measured[index].append(measurement)
+            done()
 
     def check(self, seconds: float) -> None:
         """Raise `ParameterError` if a run of this length is not possible."""

@@ -12,12 +12,13 @@ from msgspec.structs import replace
 from fishd.config import Config, Start
 from fishd.core import text
 from fishd.core.errors import FishdError
+from fishd.core.experiments import CurvePoint
 from fishd.core.swim_plan import MEAN_REST_S
 from fishd.lab.compare.comparison import Standing
 from fishd.lab.compare.contestants import Contestant
 from fishd.lab.compare.figures import draw as draw_gaits
 from fishd.lab.compare.live import LiveComparison
-from fishd.lab.error_budget import format_fin_angle, format_thrust
+from fishd.lab.error_budget import estimate_thrust, format_fin_angle, format_thrust
 from fishd.lab.experiment import Experiment, Progress
 from fishd.lab.identification import experiment as swim_excitation
 from fishd.lab.identification.figure import draw as draw_fit
@@ -33,6 +34,7 @@ from fishd.learning.adapt.results import (
     Fitted,
     Rung,
     Trained,
+    Wave,
 )
 from fishd.learning.adapt.verdict import judge
 from fishd.learning.run_folder.figure import draw as draw_training
@@ -69,6 +71,12 @@ def adapt(
 
     def done(line: str) -> None:
         show.done(line, session.used)
+
+    def show_wave(wave: Wave) -> None:
+        point = CurvePoint(
+            wave.frequency, wave.thrust, wave.thrust_ci95, "frequency [Hz]", unit=session.unit
+        )
+        show.estimate([], point)
 
     def careful(*remarks: str) -> None:
         for remark in remarks:
@@ -110,7 +118,7 @@ def adapt(
     show_step("searching square waves")
     search = steps.square_waves(fitted, session, seed)
     budget = max(steps.BUDGET["search"] * tank_time, steps.min_search_time(session, search))
-    waves = steps.search_square_waves(session, search, budget)
+    waves = steps.search_square_waves(session, search, budget, show_wave)
     frequency, is_used = steps.best_of(search, waves, fitted, session.amplitude)
     draw_search([folder.path / "search.png"], search, search.propose(), {}, "thrust (mN)")
     is_rejected = is_fitted and not is_used
@@ -155,6 +163,7 @@ def adapt(
     for name, reason in left_out.items():
         show.warn(f"fishctl: {name}: left out: {reason}")
     for gait in gaits:
+        show.estimate([estimate_thrust(g.contestant, g, session.unit) for g in gaits])
         fin = format_fin_angle(gait)
         done(
             f"{gait.contestant}: {format_thrust(gait, session.unit)} at {gait.frequency:.3f} Hz"

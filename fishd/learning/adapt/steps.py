@@ -174,8 +174,10 @@ def square_waves(fitted: Fitted, session: Session, seed: int) -> Search:
     return Search([restrict_to_whole_ticks(Range("frequency", low, high), session.tick)], seed)
 
 
-def search_square_waves(session: Session, search: Search, budget: float) -> list[Wave]:
-    """Try square waves until the budget is used [s]."""
+def search_square_waves(
+    session: Session, search: Search, budget: float, tried: Callable[[Wave], None]
+) -> list[Wave]:
+    """Try square waves until the budget is used [s]; tried: called with each."""
 
     def choose(_: float) -> Candidate:
         return Candidate(search.suggest())
@@ -184,6 +186,7 @@ def search_square_waves(session: Session, search: Search, budget: float) -> list
     for trial in measure_trials(session, SQUARE, {}, choose, budget):
         search.observe(trial.parameters, trial.thrust, trial.thrust_ci95)
         waves.append(Wave(trial.parameters["frequency"], trial.thrust, trial.thrust_ci95))
+        tried(waves[-1])
     return waves
 
 

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from fishd.core.experiments import CurvePoint, Estimate
 from fishd.lab.experiment import Progress
 
 if TYPE_CHECKING:
@@ -72,7 +73,18 @@ class ShownDisplay(Display):
         better = evaluation.best and (evaluation.thrust_ci95 is not None or merit > self._best)
         self._best = merit if better else self._best
         line = format_evaluation(evaluation) + (", the best so far" if better else "")
-        self._show.done(line, self._steps)
+        thrust, ci95 = evaluation.thrust, evaluation.thrust_ci95
+        self._show.done(line, self._steps, CurvePoint(evaluation.steps, thrust, ci95, "steps"))
+        if better:
+            self._show.estimate(list_estimates(evaluation))
+
+
+def list_estimates(best: "Evaluation") -> list[Estimate]:
+    """Return the thrust of the best policy, and its share of the best square wave."""
+    thrust, half = best.thrust, best.thrust_ci95
+    low, high = (None, None) if half is None else (thrust - half, thrust + half)
+    share = Estimate("of the best square wave", 100.0 * best.relative_thrust, unit="%")
+    return [Estimate("thrust of the best policy", thrust, low, high, "N"), share]
 
 
 def format_imitation(number: int, rounds: int, right: float) -> str:

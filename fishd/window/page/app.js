@@ -37,7 +37,7 @@ const state = {
   name: "", fish: [], session: null, status: null, controllers: [], events: [], jobs: new Map(),
   connection: null, driver: null, linked: false, helloed: false, refused: "", lastTick: null, tick: null, interval: 0.05,
   changedSeq: 0, own: new Set(), selected: null, edited: null, keep: recall("keep", false), estop: null,
-  notices: [], reference: null, seconds: recall("seconds", 15), heard: performance.now(),
+  notices: [], reference: null, heard: performance.now(),
 };
 let ring = new Ring(0.05), charts, view, stream, drawing = false, valuesAt = 0, later = 0;
 /** Number of connections in a row that ended without a first message. */
@@ -471,7 +471,7 @@ function renderAll() {
   renderValues();
   render(html`<${Banner} />`, byId("banner"));
   render(html`<${Drive} ...${shared} />`, byId("drive"));
-  render(html`<${ChartTools} ...${{ charts, shownName, setSeconds }} />`, byId("chart-head"));
+  render(html`<${ChartTools} ...${{ charts, shownName }} />`, byId("chart-head"));
   render(charts.cursor !== null && html`<${MarkForm} ...${{ charts, state, act }} />`, byId("chart-foot"));
   render(html`<${Experiments} ...${shared} />`, byId("experiments"));
   render(html`<${Runs} ...${shared} />`, byId("runs"));
@@ -519,12 +519,6 @@ function drawFrame(now) {
   }, charts.waitMs(now));
 }
 
-function setSeconds(seconds) {
-  state.seconds = seconds;
-  remember("seconds", seconds);
-  charts.setSeconds(seconds);
-}
-
 function buildStaticParts() {
   render(html`<h2 id="view-title" class="unseen">From above</h2><canvas id="fish" role="img"
       aria-label="The fish from above; its tail shows the command, and the true fin if it is simulated"></canvas>
@@ -537,7 +531,7 @@ function buildStaticParts() {
   });
   noteHeights.observe(banner);
   noteHeights.observe(header);
-  charts = new Charts(byId("plots"), state.seconds, { changed, say });
+  charts = new Charts(byId("plots"), { changed, say });
   charts.setRing(ring);
 }
 

@@ -10,7 +10,7 @@ const lengthText = (seconds) => (seconds > 120 && seconds % 60 === 0 ? `${second
 const tool = (name, text, run, isOff = false) =>
   html`<button type="button" aria-label=${name} title=${name} disabled=${isOff} onClick=${run}>${text}</button>`;
 
-export function ChartTools({ charts, shownName, setSeconds }) {
+export function ChartTools({ charts, shownName }) {
   const [isOpen, setOpen] = useState(false);
   const { view, actions, arrangement } = charts, { seconds } = view;
   const lengths = WINDOWS.includes(seconds) ? WINDOWS : [...WINDOWS, seconds].sort((one, other) => one - other);
@@ -26,7 +26,7 @@ export function ChartTools({ charts, shownName, setSeconds }) {
       <button type="button" id="pause" class=${view.isLive ? "" : "primary"} onClick=${actions.pause}>${view.isLive ? "Pause" : "Follow"}</button>
       <span class="together">${tool("Earlier", "‹", () => actions.pan(-PAN))}${tool("Later", "›", () => actions.pan(PAN), view.isLive)}</span>
       <span class="together">${tool("Zoom out", "−", () => actions.zoom(ZOOM))}
-        <select id="seconds" aria-label="Length of the view" value=${seconds} onChange=${(event) => setSeconds(Number(event.target.value))}>
+        <select id="seconds" aria-label="Length of the view" value=${seconds} onChange=${(event) => charts.setSeconds(Number(event.target.value))}>
           ${lengths.map((length) => html`<option value=${length}>${lengthText(length)}</option>`)}</select>
         ${tool("Zoom in", "+", () => actions.zoom(1 / ZOOM))}</span>
       <button type="button" aria-expanded=${isOpen} aria-controls="chart-list" onClick=${() => setOpen(!isOpen)}>Charts</button>

@@ -1,7 +1,7 @@
 // All charts of a fish over one common time, with one cursor.
 import { Chart, readPalette } from "./chart.js";
 import { Arrangement, CHARTS, namedChart, namedColumns } from "./chart_list.js";
-import { forceUnit, number, timeOfDay } from "./common.js";
+import { forceUnit, number, recall, remember, timeOfDay } from "./common.js";
 import { pressKey } from "./gestures.js";
 import { View } from "./view.js";
 
@@ -15,14 +15,14 @@ const MARK_AT = /^(.*?) \(tick (\d+)\)$/s;
 
 export class Charts {
   /**
-   * parent: element of the charts; seconds: length of the view
+   * parent: element of the charts
    * changed: called when view, cursor or charts have changed; say: says a text to screen readers
    */
-  constructor(parent, seconds, { changed, say }) {
+  constructor(parent, { changed, say }) {
     Object.assign(this, { parent, changed, say, length: 2, marks: [], gaps: [], limits: null, virtual: null });
     Object.assign(this, { all: [], namedCharts: [], names: "", cursor: null, first: null, drawn: 0, dirty: true });
     readPalette();
-    this.view = new View(seconds);
+    this.view = new View(recall("seconds", 15));
     this.arrangement = new Arrangement();
     this.times = this.newColumn();
     this.motion = matchMedia("(prefers-reduced-motion: reduce)");
@@ -37,7 +37,7 @@ export class Charts {
     };
     this.watch = new IntersectionObserver((entries) => {
       for (const entry of entries) this.all.find(({ root }) => root === entry.target).visible = entry.isIntersecting;
-      this.dirty = true;
+      this.#changed();
     });
     this.charts = CHARTS.map((definition) => this.#add(definition));
     this.arrange();
@@ -54,11 +54,12 @@ export class Charts {
 
   /** Use another ring, after a connection or a restart. */
   setRing(ring) {
-    this.ring = ring;
-    this.dirty = true;
+    Object.assign(this, { ring, cursor: null });
+    this.#changed();
   }
 
   setSeconds(seconds) {
+    remember("seconds", seconds);
     this.view.zoom(seconds / this.view.seconds, 1, this.ring.latest?.time);
     this.#changed();
   }
@@ -133,7 +134,7 @@ export class Charts {
   /** Show the time at the pointer or the cursor; null: the end of a view that stands still. */
   showTime(time) {
     const at = time ?? this.view.high, { ring } = this, output = document.getElementById("chart-time");
-    const text = at === null ? "" : `${timeOfDay(ring.unixTime(at))}, ${number(ring.latest.time - at, 2)} s ago`;
+    const text = at === null || !ring.latest ? "" : `${timeOfDay(ring.unixTime(at))}, ${number(ring.latest.time - at, 2)} s ago`;
     if (output && output.textContent !== text) output.textContent = text;
   }
 

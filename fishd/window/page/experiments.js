@@ -1,34 +1,19 @@
 // Experiments as child processes of the server: a form, and the jobs with the command line that each ran.
-import { call, controllerText, duration, forceUnit, html, interval, number, numberIn, quote, recall, remember, sentence, useEffect, useState } from "./common.js";
+import { call, controllerText, duration, forceUnit, html, interval, number, quote, recall, remember, sentence, useEffect, useState } from "./common.js";
 import { Curve } from "./curve.js";
 import { defaultOf, missingOf, selectionOf, shownParameters } from "./fields.js";
+import { CHECK_TIMEOUT_MS, enteredOptions, Fields, fieldsOf, useCheck, valueOf, Varied } from "./forms.js";
 import { AddToQueue, Queue } from "./queue.js";
-
-const KINDS = {
-  measure: { title: "Measure", text: "Swims and rests in turn; thrust with its 95 % interval." },
-  sweep: { title: "Sweep", text: "Measures over values of one parameter." },
-  compare: { title: "Compare", text: "Measures several controllers on this fish." },
-  record: { title: "Record", text: "Writes every tick, event and status to a file." },
-  simulate: { title: "Try first", text: "Swims a simulated fish in virtual time; the real one rests." },
-};
-
-/** Pause after an entry until the server is asked about it. */
-const CHECK_MS = 200;
-
-/** Return an input with its label; `set` gets its text. */
-const input = (label, value, set, more = {}) => html`<label class="row"><span>${label}</span>
-  <input value=${value} autocomplete="off" onInput=${(event) => set(event.target.value)} ...${more} /></label>`;
-
-/** Kinds that swim the fish, and so need the driver's role. */
-const DRIVING = ["measure", "sweep", "compare", "resume", "queue"];
+import { Estimates, Growing, Progress, shareOf } from "./progress.js";
 
 /** Start a job; take the driver's role first where it needs it. Say why it was refused, and offer to take the fish. */
 export async function startJob({ state, notice, changed, becomeDriver }, kind, options, take = false) {
-  const drives = DRIVING.includes(kind);
+  const isExperiment = state.forms?.find((form) => form.kind === kind)?.is_experiment && !options.recordings?.length;
+  const drives = kind === "queue" || (kind === "resume" ? options.on !== "simulation" : isExperiment && options.on !== "simulation");
   try {
     if (drives && (take || !state.driver?.you_drive)) await becomeDriver(take);
     const more = drives && take ? { take } : {};
-    const job = await call("POST", "/api/jobs", { fish: state.name, kind, options: { ...options, ...more } });
+    const job = await call("POST", "/api/jobs", { fish: state.name, kind, options: { ...options, ...more } }, CHECK_TIMEOUT_MS);
     state.jobs.set(job.id, job);
     changed();
   } catch (error) {
@@ -46,28 +31,6 @@ export function triedThrust({ jobs, status }) {
   return Number.isFinite(tried) && forceUnit(status)[1] === "mN" ? tried : null;
 }
 
-/** Return the command line of a job and what is wrong with it, both as the server says. */
-function useCheck(fish, kind, options, isReady) {
-  const [answer, setAnswer] = useState({ command: [], problem: "" });
-  const body = JSON.stringify({ fish, kind, options });
-  useEffect(() => {
-    if (!isReady) return undefined;
-    let isOld = false;
-    const timer = setTimeout(() => call("POST", "/api/jobs/check", JSON.parse(body)).then(
-      (checked) => isOld || setAnswer(checked),
-      (error) => isOld || setAnswer({ command: [], problem: error.message }),
-    ), CHECK_MS);
-    return () => {
-      isOld = true;
-      clearTimeout(timer);
-    };
-  }, [body, isReady]);
-  return answer;
-}
-
-/** Leave out what is not given: the server has its own defaults. */
-const given = (options) => Object.fromEntries(Object.entries(options).filter(([, value]) => value !== null));
-
 /** Return the selected controller with those of its parameters that are not the defaults. */
 export function selectionWithOwn(state) {
   const { controller, edited, applied } = selectionOf(state);
@@ -79,107 +42,116 @@ export function selectionWithOwn(state) {
   return { controller, own: Object.fromEntries(own), missing };
 }
 
+/** Kind of experiment, and what was entered for each: the fields of the command line, and the arguments before them. */
+const NOTHING = { kind: "measure", entered: {}, words: { contestants: "square swing" }, varied: [{ name: "", text: "" }] };
+
 export function Experiments(page) {
   const { state, notice } = page;
-  const [form, setForm] = useState(() => recall("experiment", {
-    kind: "measure", seconds: "", values: "", parameter: "", contestants: "square swing", runs: "", subject: "", note: "",
-  }));
-  const { controller, own, missing } = selectionWithOwn(state);
-  const set = (key) => (value) => {
-    const next = { ...form, [key]: value };
-    remember("experiment", next);
-    setForm(next);
+  const [entry, setEntry] = useState(() => recall("forms", NOTHING));
+  const [failure, setFailure] = useState("");
+  const paired = Boolean(state.session?.paired);
+  const load = () => call("GET", "/api/forms").then((forms) => {
+    Object.assign(state, { forms });
+    setFailure("");
+    page.changed();
+  }, (error) => setFailure(error.message));
+  useEffect(() => {
+    if (paired && !state.forms) load();
+  }, [paired]);
+  const set = (more) => {
+    const next = { ...entry, ...more };
+    remember("forms", next);
+    setEntry(next);
   };
-  const mayDrive = state.session?.scope === "drive";
-  const names = (controller?.parameters ?? []).filter(({ kind }) => kind === "number" || kind === "integer").map(({ name }) => name);
-  const varied = names.includes(form.parameter) ? form.parameter : names[0];
-  const seconds = form.seconds.trim() === "" ? null : numberIn(form.seconds);
-
-  const uses = ["measure", "sweep", "simulate"].includes(form.kind);
-
-  const options = () => {
-    switch (form.kind) {
-      case "record": return { seconds, subject: form.subject || null, note: form.note || null };
-      case "compare": return { contestants: form.contestants.split(/\s+/).filter(Boolean), seconds, runs: form.runs.trim() === "" ? null : numberIn(form.runs) };
-      case "sweep": return { controller: controller.name, parameters: { ...own, [varied]: form.values }, seconds };
-      default: return { controller: controller.name, parameters: own, seconds };
-    }
-  };
-  const isEmpty = form.kind === "sweep" ? !form.values.trim() : form.kind === "compare" && !form.contestants.trim();
-  const hasNothing = form.kind === "sweep" && controller && names.length === 0;
-  const needs = uses && missing.length > 0;
-  const isReady = Boolean(controller) && !isEmpty && !hasNothing && !needs && Boolean(state.session?.paired);
-  const { command, problem } = useCheck(state.name, form.kind, isReady ? given(options()) : {}, isReady);
-  const total = isReady && command.length ? expected(command) : null;
-  const start = (event) => {
-    event.preventDefault();
-    startJob(page, form.kind, given(options()));
-  };
-  const jobs = [...state.jobs.values()].filter(({ fish, kind }) => kind !== "queue" && (!fish || fish === state.name)).sort((a, b) => b.id - a.id).slice(0, 8);
-  return html`
-    <h2 id="experiments-title">Experiments</h2>
+  const forms = (state.forms ?? []).filter(({ kind }) => kind !== "rerun");
+  const form = forms.find(({ kind }) => kind === entry.kind) ?? forms[0];
+  if (!form) {
+    return html`<h2 id="experiments-title">Experiments</h2>${failure ? html`<p class="note">The forms cannot be read. ${sentence(failure)}</p>
+      <button type="button" onClick=${load}>Try again</button>` : html`<p class="muted">Loading …</p>`}`;
+  }
+  return html`<h2 id="experiments-title">Experiments</h2>
     <div class="tabs" role="tablist" aria-label="Kind of experiment">
-      ${Object.entries(KINDS).map(([kind, { title }]) => html`<button type="button" role="tab" id=${`tab-${kind}`}
-        aria-selected=${form.kind === kind} aria-controls="experiment" onClick=${() => set("kind")(kind)}>${title}</button>`)}
+      ${forms.map(({ kind, title }) => html`<button type="button" role="tab" id=${`tab-${kind}`}
+        aria-selected=${form.kind === kind} aria-controls="experiment" onClick=${() => set({ kind })}>${title}</button>`)}
     </div>
-    <form id="experiment" role="tabpanel" aria-labelledby=${`tab-${form.kind}`} onSubmit=${start}>
-      <p class="summary">${KINDS[form.kind].text}</p>
-      ${uses && controller && html`<p class="with">With <b>${controllerText(controller.name, own)}</b><span class="muted">, as in the panel Controller</span></p>`}
-      <div class="form">
-        ${form.kind === "sweep" && html`<label class="row"><span>Parameter</span>
-          <select value=${varied} onChange=${(event) => set("parameter")(event.target.value)}>
-            ${names.map((name) => html`<option value=${name}>${name}</option>`)}</select></label>
-          ${input("Values", form.values, set("values"), { required: true, placeholder: "1:2:0.2 or 1,1.5,2" })}`}
-        ${form.kind === "compare" && html`
-          ${input("Contestants", form.contestants, set("contestants"), { required: true, placeholder: "square swing:C=0.6" })}
-          ${input("Runs of each", form.runs, set("runs"), { inputmode: "numeric", placeholder: "1", class: "number" })}`}
-        ${form.kind === "record" && html`
-          ${input("Fish", form.subject, set("subject"), { placeholder: "name or number" })}
-          ${input("Note", form.note, set("note"), { placeholder: "purpose" })}`}
-        ${input("Seconds", form.seconds, set("seconds"), {
-          inputmode: "decimal", class: "number", placeholder: { record: "until stopped", sweep: "30 each", simulate: "20" }[form.kind] ?? "60",
-          "aria-invalid": isReady && problem !== "", "aria-describedby": "preview",
-        })}
-      </div>
-      <div id="preview" aria-live="polite">
-        ${hasNothing ? html`<p class="muted">${controller.name} has no number to sweep: choose another controller.</p>`
-          : needs ? html`<p class="muted">Needed first, in the panel Controller: ${missing.map(({ name }) => name).join(", ")}.</p>`
-          : isReady && problem ? html`<p class="note">${sentence(problem)}</p>`
-            : isReady && command.length > 0 && html`<code tabindex="0" aria-label="Command line to come">${command.map(quote).join(" ")}</code>
-              ${total && html`<p class="muted">Takes about ${duration(total)}${form.kind === "simulate" ? " of virtual time" : ""}.</p>`}`}
-      </div>
-      <div class="buttons">
-        <button class="primary" disabled=${!mayDrive || !isReady || problem !== ""}>${form.kind === "simulate" ? "Try on a simulated fish" : KINDS[form.kind].title}</button>
-        ${DRIVING.includes(form.kind) && html`<${AddToQueue} page=${page} kind=${form.kind} options=${() => given(options())} disabled=${!mayDrive || !isReady || problem !== ""} />`}
-        ${form.kind === "compare" && controller && html`<button type="button"
-          onClick=${() => set("contestants")(`${form.contestants.trim()} ${controllerText(controller.name, own)}`.trim())}>Add ${controller.name}</button>`}
-      </div>
-    </form>
+    <${Experiment} key=${form.kind} ...${{ page, form, entry, set }} />
     <${Queue} page=${page} />
     <ul class="jobs" aria-label="Started experiments">
-      ${jobs.map((job) => html`<${Job} key=${job.id} job=${job} state=${state} notice=${notice} mayDrive=${mayDrive}
+      ${[...state.jobs.values()].filter(({ fish, kind }) => kind !== "queue" && (!fish || fish === state.name)).sort((a, b) => b.id - a.id).slice(0, 8)
+        .map((job) => html`<${Job} key=${job.id} job=${job} state=${state} notice=${notice} mayDrive=${state.session?.scope === "drive"}
         resume=${() => startJob(page, "resume", { run: job.run })} />`)}
     </ul>`;
 }
 
-/** Return the number of values that a sweep measures for a word such as 1,1.5,2 or 0.4:4:0.2. */
-const countValues = (word) => word.split(",").reduce((sum, part) => {
-  const [low, high, step] = part.split(":").map(Number);
-  return sum + (step > 0 ? Math.floor((high - low) / step + 1e-6) + 1 : 1);
-}, 0);
+/** Return the arguments of an experiment, as the server takes them. */
+function argumentsOf(form, { words, varied }, controller, own) {
+  const list = (words[form.argument] ?? "").split(/[\s]+/).filter(Boolean);
+  switch (form.argument) {
+    case "controller": return { controller: controller?.name, parameters: form.values === "one" ? own
+      : { ...own, ...Object.fromEntries(varied.map(({ name, text }) => [name, text.trim()])) } };
+    case "contestants": case "recordings": return { [form.argument]: list };
+    case "name": return list.length ? { name: words.name.trim() } : {};
+    default: return {};
+  }
+}
 
-/** Return the expected duration of a job from its command line; null if it is not known. */
-function expected([, verb, ...words]) {
-  const valueOf = (name) => (words.includes(name) ? words[words.indexOf(name) + 1] : null);
-  const each = Number(valueOf("--for") ?? NaN);
-  const place = words.findIndex((word) => word.startsWith("--"));
-  const times = {
-    measure: () => 1, record: () => 1, simulate: () => 1,
-    sweep: () => words.reduce((product, word) => product * (/^[\d.]+[,:]/.test(word) ? countValues(word) : 1), 1),
-    compare: () => place * Number(valueOf("--runs") ?? 1),
-  }[verb];
-  const seconds = times ? times() * each : NaN;
-  return seconds > 0 ? seconds : null;
+/** One form, its preview, and its buttons. */
+function Experiment({ page, form, entry, set }) {
+  const { state } = page, { kind } = form;
+  const { controller, own, missing } = selectionWithOwn(state);
+  const entered = entry.entered[kind] ?? {}, words = entry.words;
+  const edit = (name, value) => set({ entered: { ...entry.entered, [kind]: { ...entered, [name]: value } } });
+  const say = (text) => set({ words: { ...words, [form.argument]: text } });
+  const mayDrive = state.session?.scope === "drive", uses = form.argument === "controller";
+  const varies = uses && form.values !== "one", isRange = form.values === "range";
+  const names = (controller?.parameters ?? []).filter((field) => !isRange || field.kind === "number").map(({ name }) => name);
+  const kept = entry.varied.filter(({ name }) => names.includes(name));
+  const varied = varies ? (kept.length ? kept : [{ name: names[0], text: isRange ? ":" : "" }]) : [];
+  const hasNothing = varies && controller && names.length === 0;
+  const needed = uses ? missing.filter(({ name }) => !varied.some((row) => row.name === name)) : [];
+  const isComplete = !uses || (controller && !hasNothing && needed.length === 0 && varied.every(({ text }) => text.trim()));
+  const isReady = Boolean(isComplete && !form.problem && state.session?.paired);
+  const options = isReady ? { ...argumentsOf(form, { words, varied }, controller, own), ...enteredOptions(form, entered) } : {};
+  const { command, problem, plan } = useCheck(state.name, kind, options, isReady);
+  const start = (event) => {
+    event.preventDefault();
+    startJob(page, kind, options);
+  };
+  const text = (label, placeholder) => html`<label class="row"><span>${label}</span><input value=${words[form.argument] ?? ""} autocomplete="off"
+    spellcheck=${false} placeholder=${placeholder} onInput=${(event) => say(event.target.value)} /></label>`;
+  return html`<form id="experiment" role="tabpanel" aria-labelledby=${`tab-${kind}`} onSubmit=${start}>
+      <p class="summary">${form.about}</p>
+      ${form.problem && html`<p class="note">Not on this machine: ${form.problem}.</p>`}
+      ${uses && controller && html`<p class="with">With <b>${controllerText(controller.name, own)}</b><span class="muted">, as in the panel Controller</span></p>`}
+      <div class="form">
+        ${varies && !hasNothing && html`<${Varied} rows=${varied} names=${names} isRange=${isRange} set=${(rows) => set({ varied: rows })} />`}
+        ${form.argument === "contestants" && text("Contestants", "best square wave, swing, policies of this fish")}
+        ${form.argument === "recordings" && text("Recordings", "none: first swim an excitation")}
+        ${form.argument === "name" && text("Name", "date and time")}
+      </div>
+      <${Fields} form=${form} entered=${entered} edit=${edit} disabled=${Boolean(form.problem)} />
+      <div id="preview" aria-live="polite">
+        ${hasNothing ? html`<p class="muted">${controller.name} has no ${isRange ? "number to search" : "parameter to vary"}: choose another controller.</p>`
+          : needed.length ? html`<p class="muted">Needed first, in the panel Controller: ${needed.map(({ name }) => name).join(", ")}.</p>`
+          : isReady && problem ? html`<p class="note">${sentence(problem)}</p>`
+            : isReady && command.length > 0 && html`<code tabindex="0" aria-label="Command line to come">${command.map(quote).join(" ")}</code>
+              ${plan && html`<p class="muted">${planText(plan, form, entered)}</p>`}`}
+      </div>
+      <div class="buttons">
+        <button class="primary" disabled=${!mayDrive || !isReady || problem !== ""}>${kind === "simulate" ? "Try on a simulated fish" : form.title}</button>
+        ${form.is_experiment && !options.recordings?.length && html`<${AddToQueue} ...${{ page, kind, options }} disabled=${!mayDrive || !isReady || problem !== ""} />`}
+        ${form.argument === "contestants" && controller && html`<button type="button"
+          onClick=${() => say(`${(words.contestants ?? "").trim()} ${controllerText(controller.name, own)}`.trim())}>Add ${controller.name}</button>`}
+      </div>
+    </form>`;
+}
+
+/** Return how long an experiment takes, as its verb says. */
+function planText({ amount, unit, seconds }, form, entered) {
+  const takes = `Takes ${form.fields.some(({ name }) => name === "budget") ? "at most" : "about"}`;
+  if (seconds !== null) return `${takes} ${duration(seconds)}.`;
+  const isVirtual = fieldsOf(form, entered).some((field) => field.name === "on" && valueOf(field, entered) === "simulation");
+  return `${takes} ${+amount.toFixed(1)} ${unit}${isVirtual && unit.startsWith("s") && unit !== "steps" ? ", in virtual time" : ""}.`;
 }
 
 /** Return a line of fishctl without its name. */
@@ -203,19 +175,20 @@ function Job({ job, state, notice, mayDrive, resume }) {
     return () => clearInterval(timer);
   }, [runs]);
   const elapsed = job.elapsed + (runs ? secondsSinceReceived(job) : 0);
-  const total = job.kind === "simulate" ? null : expected(job.command), ends = runs && total && elapsed > total;
+  const [, left] = shareOf(job, elapsed), { estimates, doing } = job.progress ?? {}, title = state.forms?.find(({ kind }) => kind === job.kind)?.title ?? job.kind;
+  const isDone = job.state === "done", hasAnswer = isDone && estimates?.length > 0 && job.kind !== "measure";
   const ask = (what) => () => call("POST", `/api/jobs/${job.id}/${what}`).catch((error) => notice("error", error.message, error.remedy));
   return html`<li class=${`job ${job.state}`}>
-    <div class="job-head"><b>${KINDS[job.kind]?.title ?? "Rerun"}</b><span class="pill small">${job.state}</span>
-      <span class="muted">${job.state === "lost" ? "" : duration(elapsed)}${ends ? ", soon at its end" : runs && total ? ` of about ${duration(total)}` : ""}</span>
+    <div class="job-head"><b>${title}</b><span class="pill small">${job.state}</span>
+      <span class="muted">${job.state === "lost" ? "" : duration(elapsed)}${runs && left ? `, ${left}` : ""}</span>
       <span class="buttons">${runs && html`<button type="button" disabled=${!mayDrive} onClick=${ask("stop")}>Stop</button>`}
         ${job.resumable && html`<button type="button" disabled=${!mayDrive} onClick=${resume}>Resume</button>`}
         ${!runs && html`<button type="button" disabled=${!mayDrive} aria-label=${`Dismiss ${job.kind}`} onClick=${ask("dismiss")}>Dismiss</button>`}</span></div>
-    ${runs && html`<progress key=${`${total && !ends}`} max=${total ?? undefined} value=${total && !ends ? elapsed : undefined}
-      aria-label=${`Progress of ${job.kind}`}></progress>`}
+    ${runs && html`<${Progress} job=${job} elapsed=${elapsed} />`}
     <code tabindex="0" aria-label="Command line">${job.command.map(quote).join(" ")}</code>
-    <${Result} job=${job} status=${state.status} />
-    ${job.state !== "done" && !(job.state === "stopped" && job.result) && job.lines?.length > 0 && html`<p class="last">${plain(job.lines.at(-1))}</p>`}
+    ${hasAnswer ? html`${doing && html`<p class="result">${sentence(doing)}</p>`}<${Estimates} estimates=${estimates} title="result" />` : html`<${Result} job=${job} status=${state.status} />`}
+    <${Growing} points=${job.points} />
+    ${(job.state !== "done" || job.exit !== 0) && !(job.state === "stopped" && job.result) && job.lines?.length > 0 && html`<p class="last">${plain(job.lines.at(-1))}</p>`}
   </li>`;
 }
 

@@ -11,16 +11,20 @@ export function sliderOf(field, status) {
   }
   if (!Number.isFinite(low) || !Number.isFinite(high) || low >= high) return null;
   const { step } = field;
+  if (!step) return null;
   if (field.low_open && low === field.low) low += step;
   if (field.high_open && high === field.high) high -= step;
   return { low, high, step };
 }
 
-/** A text field that keeps what is being typed while the page is drawn again. */
-function Text({ value, commit, ...more }) {
+/** A text field that keeps what is being typed while the page is drawn again; with `isLive`, each key is an entry. */
+export function Text({ value, commit, isLive, ...more }) {
   const [draft, setDraft] = useState(null);
   return html`<input autocomplete="off" spellcheck=${false} ...${more} value=${draft ?? value}
-    onInput=${(event) => setDraft(event.target.value)} onBlur=${() => setDraft(null)}
+    onInput=${(event) => {
+      setDraft(event.target.value);
+      if (isLive) commit(event.target.value);
+    }} onBlur=${() => setDraft(null)}
     onChange=${(event) => {
       commit(event.target.value);
       setDraft(null);
@@ -34,7 +38,7 @@ const Choice = ({ value, options, pick, ...more }) => html`<select ...${more} va
   ${(value ?? "") === "" && html`<option value="" disabled>choose</option>`}
   ${options.map(([word, text = word, isOff = false]) => html`<option value=${word} disabled=${isOff}>${text}</option>`)}</select>`;
 
-const OTHER = "/";
+const OTHER = "/", NONE = "/";
 /** Return what the card of a policy says about its training, in a sentence. */
 function cardText({ card, inputs }) {
   const { provenance, tick, amplitude } = card, { plant, relative_thrust: relative } = provenance;
@@ -73,7 +77,7 @@ function Policy({ fish, value, commit, id, disabled, help }) {
 }
 
 /** The input of a value that is neither a switch nor a word of its own. */
-function Value({ field, value, special, id, fish, disabled, status, send }) {
+function Value({ field, value, special, id, fish, disabled, status, send, isLive }) {
   const numeric = field.kind === "number" || field.kind === "integer", help = `${id}-help`;
   if (field.kind === "boolean" && value !== null) {
     return html`<input id=${id} type="checkbox" checked=${value} disabled=${disabled} aria-describedby=${help} onChange=${(event) => send(event.target.checked)} />`;
@@ -82,21 +86,23 @@ function Value({ field, value, special, id, fish, disabled, status, send }) {
     return html`<${Choice} id=${id} value=${null} options=${[["yes"], ["no"]]} disabled=${disabled} aria-describedby=${help} pick=${(word) => send(word === "yes")} />`;
   }
   if (field.kind === "choice") {
-    return html`<${Choice} id=${id} value=${value} options=${field.choices.map((word) => [word])} disabled=${disabled} aria-describedby=${help} pick=${send} />`;
+    const options = [...(field.optional ? [[NONE, "default"]] : []), ...field.choices.map((word) => [word])];
+    return html`<${Choice} id=${id} value=${field.optional ? value ?? NONE : value} options=${options} disabled=${disabled} aria-describedby=${help}
+      pick=${(word) => send(word === NONE ? null : word)} />`;
   }
   if (field.file === ".onnx") return html`<${Policy} fish=${fish} value=${value} commit=${send} id=${id} disabled=${disabled} help=${help} />`;
   const shown = typeof value === "number" ? +value.toPrecision(6) : special === null ? value : "";
-  return html`<${Text} id=${id} class=${numeric ? "number" : "text"} inputmode=${numeric ? "decimal" : "text"} disabled=${disabled || special !== null} value=${shown ?? ""}
+  return html`<${Text} id=${id} isLive=${isLive} class=${numeric ? "number" : "text"} inputmode=${numeric ? "decimal" : "text"} disabled=${disabled || special !== null} value=${shown ?? ""}
     placeholder=${special === "null" && field.unit === "rad" && status ? short(status.amplitude_limit) : field.file ? `path of a ${field.file} file` : ""}
     aria-describedby=${help} commit=${(text) => send(numeric ? numberIn(text) : text)} />`;
 }
 
 /** One parameter with its label, unit, bounds and description; `edit` gets its name and new value. */
-export function Field({ field, value, disabled, fish, status, edit }) {
-  const id = `parameter-${field.name}`;
+export function Field({ field, value, disabled, fish, status, edit, prefix = "parameter", isLive }) {
+  const id = `${prefix}-${field.name}`;
   const slider = sliderOf(field, status);
   const special = value === null && field.optional ? "null" : field.words?.includes(value) ? value : null;
-  const specials = [...(field.optional ? ["null"] : []), ...(field.words ?? [])];
+  const specials = [...(field.optional && field.kind !== "choice" ? ["null"] : []), ...(field.words ?? [])];
   const fallback = typeof defaultOf(field) === "number" ? defaultOf(field) : slider?.high;
   const nullName = field.name === "amplitude" ? "limit" : "default";
   const send = (entered) => edit(field.name, entered);
@@ -106,7 +112,7 @@ export function Field({ field, value, disabled, fish, status, edit }) {
       ${specials.map((word) => html`<label class="special"><input type="checkbox" disabled=${disabled} checked=${special === word}
         onChange=${(event) => send(event.target.checked ? (word === "null" ? null : word) : fallback)} />
         ${word === "null" ? nullName : word}</label>`)}
-      <${Value} ...${{ field, value, special, id, fish, disabled, status, send }} /><span class="unit">${unitText(field.unit)}</span>
+      <${Value} ...${{ field, value, special, id, fish, disabled, status, send, isLive }} /><span class="unit">${unitText(field.unit)}</span>
     </span>
     ${slider && html`<span class="slide"><span>${short(slider.low)}</span><input type="range" aria-label=${`${field.name}, slider`} min=${slider.low} max=${slider.high}
       step=${slider.step} disabled=${disabled || special !== null} value=${special === null ? value ?? fallback : fallback}

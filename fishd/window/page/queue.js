@@ -1,6 +1,8 @@
 // The queue of experiments of this fish: what runs, what waits, how long it takes. `fishctl queue` shows the same.
-import { call, duration, html, quote, sentence, useEffect, useState } from "./common.js";
+import { call, duration, html, numberIn, quote, sentence, useEffect, useState } from "./common.js";
 import { startJob } from "./experiments.js";
+import { Text } from "./fields.js";
+import { CHECK_TIMEOUT_MS } from "./forms.js";
 
 const POLL_MS = 2000;
 const clock = new Intl.DateTimeFormat([], { hour: "2-digit", minute: "2-digit", hourCycle: "h23" });
@@ -13,7 +15,7 @@ let latest = 0;
 async function ask({ state, changed }, change) {
   const mine = ++latest, path = `/api/fish/${encodeURIComponent(state.name)}/queue`;
   try {
-    const queue = await (change ? call("POST", path, change) : call("GET", path));
+    const queue = await (change ? call("POST", path, change, CHECK_TIMEOUT_MS) : call("GET", path));
     if (mine === latest) state.queue = { ...queue, received: performance.now(), failure: "" };
   } catch (error) {
     if (!change && mine === latest) state.queue = { ...state.queue, failure: error.message };
@@ -35,15 +37,16 @@ export function AddToQueue({ page, kind, options, disabled }) {
   const [isAdding, setAdding] = useState(false);
   const add = async () => {
     setAdding(true);
-    await change(page, "add", { kind, options: options() });
+    await change(page, "add", { kind, options });
     setAdding(false);
   };
   return html`<button type="button" disabled=${disabled || isAdding} onClick=${add}>${isAdding ? "Adding …" : "Add to queue"}</button>`;
 }
 
-/** Return the unix time at which a clock shows the time of an input next, such as 18:00. */
+/** Return the unix time at which a clock next shows a time of day, such as 18:00 or 1800; NaN if it is none. */
 function nextTime(text) {
-  const [hours, minutes] = text.split(":").map(Number), when = new Date();
+  const [, hours, minutes] = /^ *(\d{1,2})[:. ]?(\d\d) *$/.exec(text) ?? [], when = new Date();
+  if (!(hours < 24 && minutes < 60)) return NaN;
   when.setHours(hours, minutes, 0, 0);
   if (when <= Date.now()) when.setDate(when.getDate() + 1);
   return when / 1000;
@@ -71,6 +74,11 @@ export function Queue({ page }) {
   const left = Math.max(0, queue.left - passed), about = queue.unknown ? "at least" : "about";
   const button = (text, action, kind = "") => html`<button type="button" class=${kind} disabled=${!mayDrive} onClick=${action}>${text}</button>`;
   const send = (op, args) => () => change(page, op, args);
+  const stopAt = (text) => {
+    const at = nextTime(text);
+    if (at) change(page, "pause", { at });
+    else page.notice("warning", `'${text}' is not a time of day`, "Write it as 18:00.");
+  };
   return html`<section class="queue" aria-labelledby="queue-title">
     <div class="head-row"><h3 class="queue-title" id="queue-title">Queue <span class=${`pill small ${queue.state}`}>${queue.state}</span></h3>
       ${queue.items.length > 0 && html`<span class="muted">${queue.items.length} in it, ${about} ${duration(left)}, until ${timeText(Date.now() / 1000 + left)} ${
@@ -84,8 +92,8 @@ export function Queue({ page }) {
     ${(queue.items.length > 0 || isRunning) && html`<div class="buttons">
       ${!isRunning ? button("Start queue", () => startJob(page, "queue", {}), "primary")
         : html`${!queue.pauses && button("Pause after this one", send("pause"))}${button("Stop now", send("stop"), "stop")}`}
-      <label class="special">Stop at <input type="time" disabled=${!mayDrive} value=${queue.pause_at === null ? "" : timeText(queue.pause_at)}
-        onChange=${(event) => event.target.value && change(page, "pause", { at: nextTime(event.target.value) })} /></label>
+      <label class="special">Stop at <${Text} class="number" placeholder="18:00" disabled=${!mayDrive}
+        value=${queue.pause_at === null ? "" : timeText(queue.pause_at)} commit=${stopAt} /></label>
       ${(queue.pauses || queue.pause_at !== null) && button("Do not pause", send("cancel-pause"))}
       ${button("Clear", send("clear"))}
       ${queue.pauses && html`<span class="muted">It pauses after this run.</span>`}</div>`}
@@ -98,13 +106,14 @@ export function Queue({ page }) {
 function Item({ item, place, queue, mayDrive, passed, send }) {
   const runs = item.id === queue.current, number = { number: item.id }, words = item.words.join(" ");
   const elapsed = queue.elapsed + passed, each = item.seconds === null ? "" : duration(item.seconds);
-  const what = runs ? `runs, ${duration(elapsed)}${each && ` of about ${each}`}` : `${item.run ? "interrupted, is resumed" : "waits"}${each && `, about ${each} each`}`;
+  const waits = item.run ? "interrupted, is resumed" : "waits";
+  const what = runs ? `runs, ${duration(elapsed)}${each && ` of about ${each}`}` : `${waits}${each && `, about ${each} each`}`;
   const button = (text, label, action, isOff) => html`<button type="button" aria-label=${`${label} ${words}`} title=${label}
     disabled=${!mayDrive || isOff} onClick=${action}>${text}</button>`;
-  return html`<li class=${`job ${runs ? "running" : ""}`}>
+  return html`<li class="queued">
     <div class="job-head"><span class="muted">${what}</span><span class="buttons">
-      <label class="special">Runs <input class="number" type="number" min="1" max="1000" value=${item.repeat} disabled=${!mayDrive} aria-label=${`Runs of ${words}`}
-        onChange=${(event) => event.target.value > 0 && send("repeat", { ...number, repeat: Number(event.target.value) })()} /></label>
+      <label class="special">Runs <${Text} class="number" inputmode="numeric" value=${item.repeat} disabled=${!mayDrive} aria-label=${`Runs of ${words}`}
+        commit=${(text) => send("repeat", { ...number, repeat: numberIn(text) })()} /></label>
       ${button("↑", "Move up", send("move", { ...number, position: place }), place === 0)}
       ${button("↓", "Move down", send("move", { ...number, position: place + 2 }), place === queue.items.length - 1)}
       ${button("Remove", "Remove", send("remove", number), runs)}</span></div>

@@ -159,9 +159,8 @@ export class Ring extends Columns {
 
   /** Return the number of the first tick at or after a time; null if it is not kept. */
   seqAt(time) {
-    if (!(time >= this.oldest - this.period)) return null;
-    let age = this.newer(time - 0.5 * this.period);
-    while (age >= 1 && Number.isNaN(this.value("seq", age))) age--;
+    let age = time >= this.oldest - this.period ? this.newer(time - 0.5 * this.period) : 0;
+    if (Number.isNaN(this.value("seq", age))) age--; // a gap
     return age >= 1 ? this.value("seq", age) : null;
   }
 
@@ -176,7 +175,7 @@ export class Ring extends Columns {
   unixTime(time) {
     const level = time >= this.oldest ? this : this.past;
     const t = level.value("t", Math.max(1, level.newer(time - 0.5 * level.period)));
-    return Number.isNaN(t) ? this.latest.t - this.latest.time + time : t;
+    return Number.isNaN(t) && this.latest ? this.latest.t - this.latest.time + time : t;
   }
 }
 

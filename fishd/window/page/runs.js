@@ -8,6 +8,8 @@ import { Trash } from "./trash.js";
 /** Number of runs that are shown at first, and by which more are shown. */
 const PAGE_RUNS = 40;
 const MAX_COMPARED = 12;
+/** Number of days back from now to the begin of a run, by title. */
+const AGES = { "any time": Infinity, "last day": 1, "last week": 7, "last month": 31, "last year": 366 };
 const shortDate = new Intl.DateTimeFormat([], { month: "short", day: "numeric", hour: "2-digit", minute: "2-digit", hourCycle: "h23" });
 
 const beginOf = (run) => run.began ?? run.about?.started ?? "";
@@ -33,18 +35,19 @@ const ORDERS = {
   "most thrust first": (a, b) => (b.thrust ?? -Infinity) - (a.thrust ?? -Infinity),
 };
 
-/** Return whether a run has all words of a text in its name, its kind, or what is noted of it. */
+/** Return whether a run has all words of a text in its name, its kind, or what is noted of it, or as its date. */
 function hasWords(run, text) {
   const { subject, note, operator } = run.about ?? {};
   const known = [run.name, whatOf(run), subject, note, operator, ...(run.command ?? [])].join(" ").toLowerCase();
-  return text.toLowerCase().split(/\s+/).every((word) => known.includes(word));
+  return text.toLowerCase().split(/\s+/).every((word) => known.includes(word)
+    || (word.length >= 4 && beginOf(run).startsWith(word)));
 }
 
 export function Runs(page) {
   const { state } = page;
   const [runs, setRuns] = useState(null), [failure, setFailure] = useState(null);
   const [open, setOpen] = useState(null), [count, setCount] = useState(PAGE_RUNS);
-  const [filter, setFilter] = useState({ text: "", controller: "", since: "", order: "newest first" });
+  const [filter, setFilter] = useState({ text: "", controller: "", age: "any time", order: "newest first" });
   const [picked, setPicked] = useState([]), [compared, setCompared] = useState(null), [changes, setChanges] = useState(0);
   const finished = [...state.jobs.values()].filter(({ state: at }) => at !== "running").length;
   const load = () => call("GET", "/api/runs").then((found) => {
@@ -61,9 +64,11 @@ export function Runs(page) {
     setFilter({ ...filter, [name]: event.target.value });
     setCount(PAGE_RUNS);
   };
+  const choose = (title, name, values) => html`<label>${title} <select value=${filter[name]} onChange=${set(name)}>
+    ${Object.keys(values).map((value) => html`<option value=${value}>${value}</option>`)}</select></label>`;
   const shown = (runs ?? []).filter((run) => hasWords(run, filter.text.trim())
     && (!filter.controller || controllersOf(run, known).includes(filter.controller))
-    && (!filter.since || timeOf(run) >= new Date(`${filter.since}T00:00`).getTime())).sort(ORDERS[filter.order]);
+    && timeOf(run) >= Date.now() - 86_400_000 * AGES[filter.age]).sort(ORDERS[filter.order]);
   const pick = (id) => () => setPicked(picked.includes(id) ? picked.filter((other) => other !== id) : [...picked, id]);
   const changed = () => setChanges((n) => n + 1);
   const hasFish = (runs ?? []).some(fishOf);
@@ -72,12 +77,10 @@ export function Runs(page) {
       && (shown.length === runs.length ? `${runs.length}` : `${shown.length} of ${runs.length}`)}</span>
       <button type="button" onClick=${changed}>Refresh</button></div>
     ${runs?.length > 0 && html`<div class="filter">
-      <label>Find <input type="search" placeholder="name, fish, note" value=${filter.text} onInput=${set("text")} /></label>
+      <label>Find <input type="search" placeholder="name, fish, note, date" value=${filter.text} onInput=${set("text")} /></label>
       <label>Controller <select value=${filter.controller} onChange=${set("controller")}><option value="">any</option>
         ${controllers.map((name) => html`<option value=${name}>${name}</option>`)}</select></label>
-      <label>Since <input type="date" value=${filter.since} onChange=${set("since")} /></label>
-      <label>Sort by <select value=${filter.order} onChange=${set("order")}>
-        ${Object.keys(ORDERS).map((name) => html`<option value=${name}>${name}</option>`)}</select></label>
+      ${choose("Began", "age", AGES)}${choose("Sort by", "order", ORDERS)}
       ${picked.length > 0 && html`<span class="buttons"><button type="button" class="primary" disabled=${picked.length < 2 || picked.length > MAX_COMPARED}
         onClick=${() => setCompared(picked)}>Compare ${picked.length}</button>
         <button type="button" onClick=${() => setPicked([])}>Pick none</button>

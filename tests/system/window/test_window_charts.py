@@ -118,6 +118,26 @@ def test_charts_stand_still_while_ticks_come_until_they_follow_again(
         assert complaints == []
 
 
+def test_a_view_that_stands_still_does_so_while_a_lost_connection_is_opened_again(
+    window: WindowProcess,
+) -> None:
+    with live_page(window.url) as (page, complaints):
+        page.evaluate("import('/app.js').then((app) => { globalThis.app = app; })")
+        page.locator(".plot").first.press("Space")
+        page.keyboard.press("ArrowLeft")
+        page.keyboard.press("Shift+ArrowLeft")
+        before = page.evaluate("(globalThis.charts = app.charts).view.span(0)")
+        ring = page.evaluate_handle("charts.ring")
+        page.evaluate("app.stream.socket.close()")
+        page.locator(".plot").first.hover()
+        wait_until(lambda: page.evaluate("(ring) => charts.ring !== ring", ring))
+        wait_until(lambda: page.evaluate("charts.ring.rows > 0"))
+        assert page.evaluate("charts.view.span(0)") == before
+        page.keyboard.press("End")
+        wait_until(lambda: page.evaluate(SPAN)[1] > before[1])
+        assert complaints == []
+
+
 def test_a_pointer_pans_by_dragging_and_zooms_around_itself_with_ctrl_and_the_wheel(
     page: Page,
 ) -> None:

@@ -51,9 +51,9 @@ async def test_a_device_that_is_not_paired_gets_only_the_page(window: WindowProc
     async with Browser(window.url, NETWORK_HOST) as browser:
         session = await browser.get("/api/session")
         assert (session["paired"], session["scope"], session["device"]) == (False, None, None)
-        for path in ("/api/fish", "/api/fish/fish/policies", "/api/jobs", "/api/runs"):
-            assert await browser.refusal(path) == (401, "not-paired")
-        for path in ("estop", "drive", "release", "request"):
+        for path in ("fish", "fish/fish/policies", "fish/fish/queue", "forms", "jobs", "runs"):
+            assert await browser.refusal(f"/api/{path}") == (401, "not-paired")
+        for path in ("estop", "drive", "release", "request", "queue"):
             assert await browser.refusal(f"/api/fish/fish/{path}", {}) == (401, "not-paired")
         assert await browser.refusal("/api/jobs", {}) == (401, "not-paired")
         assert await refuse_page(browser) == 401
@@ -83,9 +83,14 @@ async def test_a_device_that_may_watch_sees_the_fish_stops_it_and_nothing_more(
     async with paired(window, "watch", "wall") as browser, open_page(browser) as page:
         assert page.hello["session"]["scope"] == "watch"
         await page.until("ticks")
-        for what in ("drive", "release", "request"):
+        for what in ("drive", "release", "request", "queue"):
             assert await page.refusal(what) == (403, "only-watch")
+        assert (await browser.get("/api/fish/fish/queue"))["state"] == "empty"
         assert await page.refusal("/api/jobs") == (403, "only-watch")
+        body = {"fish": "fish", "kind": "measure", "options": {"controller": "square"}}
+        checked = await page.post("/api/jobs/check", body)
+        assert (checked["problem"], checked["plan"]) == ("", None)  # it starts no process
+        assert "measure" in [form["kind"] for form in await browser.get("/api/forms")]
         assert (await page.post("estop"))["way"] == "control"
     async with Browser(window.url) as browser, open_page(browser) as page:
         await page.drive()

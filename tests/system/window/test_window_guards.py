@@ -30,6 +30,7 @@ CHANGES = [
     ("/api/fish/fish/drive", {"take": True}),
     ("/api/fish/fish/release", {}),
     ("/api/fish/fish/request", {"op": "set-controller", "args": {"name": "square"}}),
+    ("/api/fish/fish/queue", {"op": "clear"}),
     ("/api/jobs", {"fish": "fish", "kind": "record"}),
     ("/api/jobs/check", {"fish": "fish", "kind": "record"}),
     ("/api/jobs/1/stop", {}),
@@ -52,7 +53,7 @@ async def test_no_name_that_leads_here_but_is_not_ours_gets_anything(
             "Host": authority, "Origin": f"http://{authority}",
             "X-Client": page.hello["client"],
         }  # fmt: skip
-        for path in ("/", "/api/session", "/api/fish", "/metrics"):
+        for path in ("/", "/api/session", "/api/fish", "/api/forms", "/metrics"):
             async with browser.session.get(path, headers=headers) as response:
                 assert response.status == 403
         for path, body in CHANGES:
@@ -97,8 +98,10 @@ async def test_another_site_starts_no_reading_either_where_the_browser_tells(
     async with Browser(window.url) as browser:
         for site in ("cross-site", "same-site"):
             headers = {"Sec-Fetch-Site": site}
-            download = "/api/runs/x/download/all.zip"
-            for path in ("/api/runs", "/metrics", download, "/api/trash", "/api/results?run=x"):
+            for path in (
+                *("/api/runs", "/api/trash", "/api/results?run=x", "/api/runs/x/download/all.zip"),
+                *("/api/fish/fish/queue", "/api/forms", "/metrics"),
+            ):
                 refused = await browser.refusal(path, headers=headers)
                 assert refused == (403, "other-origin")
 

@@ -138,6 +138,20 @@ async def test_a_simulated_fish_swims_first_and_its_curve_is_drawn(window: Windo
         ("record", {"name": "line\n"}, "bad-arguments"),
         ("record", {"note": "bell\x07"}, "bad-arguments"),
         ("compare", {"contestants": ["--folder=/"]}, "bad-arguments"),
+        ("measure", {"controller": "ppo", "parameters": {"policy": "-x.onnx"}}, "bad-arguments"),
+        ("measure", {"controller": "square", "folder": "/tmp/x"}, "bad-arguments"),
+        ("measure", {"controller": "square", "on": "moon"}, "bad-arguments"),
+        ("sweep", {"controller": "square", "parameters": {"frequency": "1;2"}}, "bad-arguments"),
+        ("sweep", {"controller": "square", "jobs": 99}, "bad-arguments"),
+        ("sweep", {"controller": "square", "cluster": "tcp://example.org:1"}, "bad-arguments"),
+        ("optimise", {"controller": "square"}, "bad-arguments"),
+        ("optimise", {"controller": "square", "budget": -1}, "bad-arguments"),
+        ("identify", {"recordings": ["../above"]}, "bad-arguments"),
+        ("identify", {"fit": "line\n"}, "bad-arguments"),
+        ("adapt", {"budget": 10}, "bad-arguments"),
+        ("adapt", {"on": "simulation", "no_command": True}, "bad-arguments"),
+        ("learn", {"seeds": 1000}, "bad-arguments"),
+        ("learn", {"settings_file": "/etc/passwd"}, "bad-arguments"),
         ("rerun", {"run": "/etc/passwd"}, "bad-arguments"),
         ("resume", {"run": "../above"}, "bad-arguments"),
         ("simulate", {"controller": "square", "seconds": 1e9}, "bad-arguments"),
@@ -176,9 +190,10 @@ async def test_a_job_is_checked_without_being_started(window: WindowProcess) -> 
     async with Browser(window.url) as browser, open_page(browser) as page:
         before = await browser.get("/api/jobs")
         body = {"fish": "fish", "kind": "measure", "options": {"controller": "square"}}
-        words = ["fishctl", "measure", "square", "--for", "60"]
+        words = ["fishctl", "measure", "square"]
         checked = await page.post("/api/jobs/check", body)
-        assert checked == {"command": words, "problem": ""}
+        plan = {"amount": 60.0, "unit": "s", "seconds": 60.0}
+        assert checked == {"command": words, "problem": "", "plan": plan}
         body["options"] = {"controller": "square", "seconds": 20}
         refused = await page.post("/api/jobs/check", body)
         assert refused["command"] == []
@@ -186,6 +201,76 @@ async def test_a_job_is_checked_without_being_started(window: WindowProcess) -> 
         body |= {"kind": "resume", "options": {"run": "none"}}
         assert (await page.post("/api/jobs/check", body))["command"] == ["fishctl", "resume"]
         assert await browser.get("/api/jobs") == before
+
+
+async def test_each_experiment_is_planned_by_its_verb(window: WindowProcess) -> None:
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        varied = {"controller": "square", "parameters": {"frequency": "1:2:0.5"}}
+        searched = {"controller": "square", "parameters": {"frequency": ":"}}
+        for kind, options, words, plan in (
+            ("sweep", varied, "square --frequency 1:2:0.5", (90.0, "s", 90.0)),
+            ("compare", {"contestants": ["square", "swing"], "runs": 2}, None, (240.0, "s", 240.0)),
+            ("optimise", {**searched, "budget": 100}, None, (100.0, "s", 100.0)),
+            ("identify", {"seconds": 30}, "--experiment --for 30", (30.0, "s", 30.0)),
+            ("adapt", {"budget": 200}, "--budget 200", (200.0, "s", 200.0)),
+            ("sweep", {**varied, "on": "simulation"}, None, (3.0, "points", None)),
+            ("learn", {"on": "simulation", "steps": 1}, None, (64.0, "steps", None)),
+            ("simulate", {"controller": "square"}, "square", (60.0, "s of virtual time", None)),
+            ("record", {}, "", None),
+        ):
+            body = {"fish": "fish", "kind": kind, "options": options}
+            checked = await page.post("/api/jobs/check", body)
+            assert checked["problem"] == ""
+            expected = plan and dict(zip(("amount", "unit", "seconds"), plan, strict=True))
+            assert checked["plan"] == expected, kind
+            if words is not None:
+                verb = kind if words == "" else f"{kind} {words}"
+                assert shlex.join(checked["command"]) == f"fishctl {verb}"
+
+
+async def test_an_experiment_on_a_simulated_fish_shows_its_curve_and_leaves_the_live_fish_alone(
+    window: WindowProcess, daemon: Daemon
+) -> None:
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        options = {"controller": "square", "parameters": {"frequency": "1:3"}, "budget": 100}
+        job = await start(page, "optimise", **options, on="simulation")
+        ended = await end_of(page, job)
+        assert ended["state"] == "done", ended["lines"]
+        assert ended["points"][0]["x_name"] == "frequency [Hz]"
+        assert len(ended["points"]) == ended["result"]["trials"]
+        best, thrust = ended["progress"]["estimates"]
+        assert (best["name"], best["unit"]) == ("best frequency", "Hz")
+        assert best["low"] <= best["value"] <= best["high"]
+        assert thrust["low"] < ended["result"]["true_thrust"] < thrust["high"]
+        assert not [line for line in ended["lines"] if "progress" in line]
+        names = [entry["name"] for entry in await browser.get("/api/runs")]
+        assert job["run"] in names
+    assert daemon.status().mode == "idle"
+
+
+async def test_the_interval_of_a_measurement_shrinks_while_it_runs(window: WindowProcess) -> None:
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        job = await start(page, "measure", controller="square", seconds=200, on="simulation")
+        ended = await end_of(page, job)
+        widths = [point["ci95"] for point in ended["points"]]
+        assert len(widths) > 10
+        assert widths[-1] < 0.5 * widths[0]
+        assert ended["progress"]["fraction"] == 1.0
+
+
+async def test_a_policy_from_a_file_is_measured_and_swept(
+    window: WindowProcess, tmp_path: Path
+) -> None:
+    policy = tmp_path / "copy of it.onnx"
+    policy.write_bytes(Path("config/policies/default-fish.onnx").read_bytes())
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        options = {"controller": "ppo", "parameters": {"policy": str(policy)}, "on": "simulation"}
+        ended = await end_of(page, await start(page, "measure", **options, seconds=30))
+        assert ended["state"] == "done", ended["lines"]
+        options["parameters"] = {"policy": f"default-fish,{policy}"}
+        body = {"fish": "fish", "kind": "sweep", "options": options}
+        checked = await page.post("/api/jobs/check", body)
+        assert (checked["problem"], checked["plan"]["amount"]) == ("", 2.0)
 
 
 async def test_no_other_job_is_stopped_by_a_wrong_number(window: WindowProcess) -> None:

@@ -13,8 +13,11 @@ from playwright.sync_api import APIResponse, Page, Route, expect
 from rigs.browser import needs_browser, open_page, shared_browser
 from rigs.live_page import RESOLVED, go, live_page, name_device, swim
 from rigs.processes import Daemon, running, wait_until
+from rigs.recordings import record_run, swum
 from rigs.virtual_pi_process import Pi
 from rigs.window_process import WindowProcess
+
+from fishd.lab.experiment import Header, open_experiment
 
 pytestmark = needs_browser
 
@@ -283,7 +286,7 @@ def test_a_page_works_in_a_browser_that_keeps_nothing(new_window: WindowProcess)
         swim(page)
         go(page, "experiments")
         page.click("#tab-record")
-        page.fill("#experiment label:has-text('Seconds') input", "0,5")
+        page.fill("#option-seconds", "0,5")
         page.click("#experiment button.primary")
         expect(page.locator(".job code")).to_contain_text("--for 0.5")
         assert complaints == []
@@ -381,7 +384,7 @@ def test_a_run_in_simulation_is_drawn_over_its_own_time_and_dismissed(
         go(page, "experiments")
         page.click("#tab-simulate")
         expect(page.locator("#preview")).to_have_text(
-            re.compile("fishctl simulate swing --for 20.*20.s of virtual time")
+            re.compile("fishctl simulate swing.*60.s of virtual time")
         )
         page.click("#experiment .primary")
         expect(page.locator(".job.done")).to_contain_text("True thrust")
@@ -398,7 +401,7 @@ def test_a_run_in_simulation_is_drawn_over_its_own_time_and_dismissed(
 def test_a_form_says_at_once_what_its_job_would_refuse(new_window: WindowProcess) -> None:
     with live_page(new_window.url) as (page, _):
         go(page, "experiments")
-        start, seconds = page.locator("#experiment .primary"), page.get_by_label("Seconds")
+        start, seconds = page.locator("#experiment .primary"), page.locator("#option-seconds")
         seconds.fill("20")
         expect(page.locator("#preview")).to_contain_text("20.25 to 3600 s are needed")
         expect(start).to_be_disabled()
@@ -409,9 +412,57 @@ def test_a_form_says_at_once_what_its_job_would_refuse(new_window: WindowProcess
         expect(page.locator("#preview")).to_contain_text("Needed first")
         expect(start).to_be_disabled()
         page.select_option("#controller", "ppo")
-        page.click("#tab-sweep")
-        expect(page.locator("#preview")).to_contain_text("ppo has no number to sweep")
+        page.click("#tab-optimise")
+        expect(page.locator("#preview")).to_contain_text("ppo has no number to search")
         expect(start).to_be_disabled()
+
+
+def test_every_experiment_of_the_command_line_has_a_form_with_its_preview(
+    new_window: WindowProcess,
+) -> None:
+    with live_page(new_window.url) as (page, complaints):
+        go(page, "experiments")
+        page.select_option("#controller", "square")
+        expect(page.get_by_role("tab")).to_have_count(9)
+        for kind in ("measure", "compare", "optimise", "identify", "adapt", "learn", "record"):
+            page.click(f"#tab-{kind}")
+            expect(page.locator("#preview code")).to_contain_text(f"fishctl {kind}")
+            expect(page.locator("#experiment .primary")).to_be_enabled()
+        assert complaints == []
+
+
+def test_a_search_on_a_simulated_fish_draws_its_curve_and_shows_the_best_with_its_interval(
+    new_window: WindowProcess,
+) -> None:
+    with live_page(new_window.url) as (page, complaints):
+        go(page, "experiments")
+        page.select_option("#controller", "square")
+        page.click("#tab-optimise")
+        page.get_by_label("Range").fill("1:3")
+        page.select_option("#option-on", "simulation")
+        expect(page.locator("#preview")).to_contain_text("--frequency 1:3 --on simulation")
+        page.click("#experiment .primary")
+        expect(page.locator(".job.done")).to_contain_text("best frequency")
+        expect(page.locator(".job.done")).to_contain_text("thrust there")
+        expect(page.get_by_role("img", name="Chart of thrust over frequency")).to_be_visible()
+        assert complaints == []
+
+
+def test_what_was_entered_is_kept_and_further_options_are_a_click_away(
+    new_window: WindowProcess,
+) -> None:
+    with live_page(new_window.url) as (page, _):
+        go(page, "experiments")
+        page.click("#tab-adapt")
+        page.locator("#option-budget").fill("200")
+        expect(page.locator("#option-no_command")).to_be_hidden()
+        page.get_by_text("More options").click()
+        expect(page.locator("#option-no_command")).to_be_checked()
+        page.select_option("#option-on", "simulation")
+        expect(page.locator("#option-no_command")).to_have_count(0)  # for a live fish only
+        expect(page.locator("#preview")).to_contain_text("fishctl adapt --budget 200 --on")
+        page.reload()
+        expect(page.locator("#option-budget")).to_have_value("200")
 
 
 def test_a_stored_run_is_opened_and_another_controller_is_run_on_it(
@@ -421,8 +472,8 @@ def test_a_stored_run_is_opened_and_another_controller_is_run_on_it(
         swim(page)
         go(page, "experiments")
         page.click("#tab-record")
-        page.get_by_label("Seconds").fill("1")
-        page.get_by_label("Note").fill("a; $(b) 'c'")
+        page.locator("#option-seconds").fill("1")
+        page.locator("#option-note").fill("a; $(b) 'c'")
         page.click("#experiment .primary")
         expect(page.locator(".job.done")).to_be_visible()
         page.select_option("#controller", "sine")
@@ -436,6 +487,93 @@ def test_a_stored_run_is_opened_and_another_controller_is_run_on_it(
         expect(page.locator(".job.done")).to_have_count(2)
         expect(page.locator(".job").first).to_contain_text("sine in place of swing")
         assert complaints == []
+
+
+@pytest.fixture
+def kept_runs(new_window: WindowProcess) -> WindowProcess:
+    """Return a window whose folder has two recordings, and an experiment with rows."""
+    folder = new_window.state.parent / "runs"
+    folder.mkdir(exist_ok=True)
+    for number in (1, 2):
+        about = {"subject": f"fish {number}", "note": f"note {number}"}
+        record_run(swum(2.0), folder / f"run {number}", **about)
+    with open_experiment(folder / "swept", Header(kind="sweep", on="simulation")) as experiment:
+        table = experiment.open_table(["controller", "frequency", "thrust", "thrust_ci95"])
+        for number in range(6):
+            row = {"frequency": 1.0 + 0.2 * number, "thrust": 0.02, "thrust_ci95": 0.001}
+            table.add({"controller": ("square", "sine")[number % 2], **row})
+    return new_window
+
+
+def test_runs_are_found_compared_noted_renamed_and_deleted_with_undo(
+    kept_runs: WindowProcess,
+) -> None:
+    with live_page(kept_runs.url) as (page, complaints):
+        go(page, "runs")
+        runs = page.locator("#runs")
+        names = runs.locator("td.name")
+        expect(names).to_have_count(3)
+        page.get_by_label("Find").fill("FISH note 2")
+        expect(names).to_have_text(["run 2note 2"])
+        page.get_by_label("Find").fill("")
+        page.get_by_label("Began").select_option("last day")
+        expect(names).to_have_count(3)
+        page.get_by_label("Find").fill("2999-01-01")
+        expect(names).to_have_count(0)
+        page.get_by_label("Find").fill("")
+        page.locator(".filter").get_by_label("Controller").select_option("swing")
+        page.get_by_label("Sort by").select_option("fish")
+        expect(names).to_have_text(["run 1note 1", "run 2note 2"])
+        for number in (1, 2):
+            page.get_by_label(f"Compare run {number}").check()
+        page.get_by_role("button", name="Compare 2").click()
+        expect(page.locator(".comparison tbody tr")).to_have_count(2)
+        expect(page.locator(".comparison img")).to_be_visible()
+        page.get_by_role("button", name="Close comparison").click()
+
+        page.get_by_role("button", name="Open run 2").click()
+        page.get_by_label("Note", exact=True).fill("better")
+        page.get_by_role("button", name="Save").click()
+        expect(names.nth(1)).to_have_text("run 2better")
+        page.get_by_label("Name", exact=True).fill("run 1")
+        page.get_by_role("button", name="Rename").click()
+        expect(page.locator("#notices")).to_contain_text("exists already")
+        page.get_by_label("Name", exact=True).fill("third")
+        page.get_by_role("button", name="Rename").click()
+        expect(page.get_by_role("button", name="Close third")).to_be_visible()
+        with page.expect_download() as download:
+            page.get_by_role("link", name="CSV", exact=True).click()
+        assert download.value.suggested_filename == "third.csv"
+        page.get_by_role("button", name="Delete").click()
+        page.get_by_role("button", name="Trash").click()
+        expect(page.locator(".trash li")).to_contain_text("third")
+        page.get_by_role("button", name="Undo").click()
+        expect(names).to_have_text(["run 1note 1", "thirdbetter"])
+        expect(page.locator(".trash li")).to_have_count(0)
+        assert [line for line in complaints if "409" not in line] == []
+
+
+def test_an_opened_run_a_comparison_and_the_trash_fit_each_screen_and_have_no_barrier(
+    kept_runs: WindowProcess,
+) -> None:
+    with live_page(kept_runs.url, bypass_csp=True) as (page, _):
+        page.evaluate(AXE.read_text(encoding="utf-8"))
+        go(page, "runs")
+        for run in ("run 1", "run 2", "swept"):
+            page.get_by_label(f"Compare {run}").check()
+        page.get_by_role("button", name="Compare 3").click()
+        page.get_by_role("button", name="Open swept").click()
+        page.get_by_role("button", name="Trash").click()
+        expect(page.locator(".rows canvas")).to_be_visible()
+        expect(page.locator(".comparison tbody tr")).to_have_count(2)
+        expect(page.locator(".comparison img")).to_be_visible()
+        expect(page.locator(".note")).to_have_count(1)  # the sweep has no recording to draw
+        expect(page.locator(".trash .muted")).to_contain_text("empty")
+        for width in (1280, 800, 390):
+            page.set_viewport_size({"width": width, "height": 844})
+            assert page.evaluate("document.documentElement.scrollWidth") == width
+            refuse_barriers(page)
+        walk(page)
 
 
 def test_lost_ticks_are_drawn_as_a_gap_and_suspect_samples_are_marked(
@@ -532,7 +670,7 @@ def show_chart_tools(page: Page) -> None:
 def walk(page: Page) -> None:
     """Reach everything that is shown with the Tab key, in reading order, the E-stop first."""
     reachable = page.evaluate("""() => {
-        const kinds = "button, input, select, a[href], [tabindex='0']";
+        const kinds = "button, input, select, summary, a[href], [tabindex='0']";
         const isReachable = (node) => !node.disabled && node.checkVisibility();
         globalThis.wanted = [...document.querySelectorAll(kinds)].filter(isReachable);
         return wanted.length;
@@ -583,6 +721,9 @@ def test_no_barrier_is_serious(window: WindowProcess) -> None:
             page.set_viewport_size({"width": width, "height": 844})
             for place in ("experiments", "runs", "fish", "live"):
                 go(page, place)
+                if place == "experiments":
+                    page.click("#tab-optimise")
+                    page.locator("#experiment details").evaluate("node => node.open = true")
                 refuse_barriers(page)
         show_chart_tools(page)
         refuse_barriers(page)
@@ -601,6 +742,60 @@ def refuse_barriers(page: Page) -> None:
             if violation["impact"] in ("serious", "critical")
         ]
         assert serious == [], (page.url, page.viewport_size, scheme)
+
+
+def test_a_queue_is_filled_ordered_started_and_stopped_without_a_mouse(
+    new_window: WindowProcess,
+) -> None:
+    with live_page(new_window.url, bypass_csp=True) as (page, complaints):
+        page.evaluate(AXE.read_text(encoding="utf-8"))
+        go(page, "experiments")
+        queue, queued = page.locator(".queue"), page.locator(".queued code")
+        expect(queue).to_contain_text("Empty")
+        for count, seconds in enumerate(("21", "50", "45")):
+            page.fill("#option-seconds", seconds)
+            add = page.get_by_role("button", name="Add to queue")
+            expect(add).to_be_enabled()
+            add.press("Enter")
+            expect(queued).to_have_count(count + 1)
+        page.get_by_role("button", name="Move up measure swing --for 45 --on=live").press("Enter")
+        expect(queued.nth(1)).to_have_text("fishctl measure swing --for 45 --on=live")
+        runs = page.get_by_label("Runs of measure swing --for 50 --on=live")
+        runs.fill("3")
+        runs.press("Tab")
+        expect(queue).to_contain_text("3 in it, about 4\N{NO-BREAK SPACE}min")
+        page.get_by_role("button", name="Remove measure swing --for 21 --on=live").press("Enter")
+        expect(queued).to_have_count(2)
+        stop_at = page.get_by_label("Stop at")
+        stop_at.fill("6 pm")
+        stop_at.press("Tab")
+        expect(page.locator(".notice.warning")).to_contain_text("is not a time of day")
+        stop_at.fill("1800")
+        stop_at.press("Tab")
+        expect(stop_at).to_have_value("18:00")
+        expect(queue.get_by_role("button", name="Do not pause")).to_be_visible()
+        walk(page)
+        refuse_flaws(page)
+        queue.get_by_role("button", name="Start queue").press("Enter")
+        expect(queue.get_by_role("progressbar")).to_be_visible()
+        expect(page.locator("#mode")).to_have_text("running")
+        refuse_flaws(page)
+        queue.get_by_role("button", name="Stop now").press("Enter")
+        expect(queue).to_contain_text("It pauses: it was to stop at ")
+        expect(queue).to_contain_text("interrupted, is resumed")
+        queue.get_by_text("Latest runs").press("Enter")
+        expect(queue).to_contain_text("interrupted, the fish rests")
+        refuse_flaws(page)
+        expect(page.locator("#mode")).to_have_text("idle")
+        assert complaints == []
+
+
+def refuse_flaws(page: Page) -> None:
+    """Fail if the page has a serious barrier, or is wider than its screen, at any width."""
+    for width in (1280, 800, 390):
+        page.set_viewport_size({"width": width, "height": 844})
+        assert page.evaluate("document.documentElement.scrollWidth") == width
+        refuse_barriers(page)
 
 
 def test_the_files_of_the_page_are_small() -> None:

@@ -1,4 +1,4 @@
-"""Runs of the page: notes, names, the trash, results and downloads; who may do what."""
+"""Runs of the page: notes, names, the trash, results and downloads, and rights to them."""
 
 import asyncio
 import csv

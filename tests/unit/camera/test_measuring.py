@@ -13,6 +13,7 @@ from fishd.camera.measuring import Measuring, learned_path
 from fishd.camera.messages import TailMessage
 from fishd.camera.settings import load
 from fishd.camera.tail.learner import CannotLearn
+from fishd.camera.tail.lens import CannotUseLens, Lens
 from fishd.core.camera_frames import Pixels
 from fishd.core.errors import FishdError, Refused
 from fishd.core.tail_reading import TailReading
@@ -34,7 +35,7 @@ class FakeLearner:
 
     problem: Exception | None = None
 
-    def __init__(self) -> None:
+    def __init__(self, lens: Lens | None) -> None:
         self.times: list[float] = []
 
     def add(self, time: float, picture: Pixels) -> None:
@@ -222,6 +223,51 @@ def test_a_damaged_file_is_said_and_the_tail_can_be_learned_again(
     thread.finish_learning()
     wait_until(lambda: thread.condition == "measuring")
     assert thread.problem == ""
+
+
+LENS = Lens(
+    date="2026-11-29",
+    size=(64, 48),
+    rotate=0,
+    views=10,
+    error=0.1,
+    focal=(64.0, 64.0),
+    centre=(32.0, 24.0),
+    distortion=(-0.1, 0.0),
+)
+
+
+def test_a_tail_is_learned_again_after_the_lens_was_calibrated(
+    start: Start, tmp_path: Path
+) -> None:
+    thread = start()
+    thread.set_lens(LENS)
+    assert (thread.condition, thread.learned, thread.problem) == ("unlearned", None, "")
+    assert Lens.load(tmp_path / "state" / "tail.lens.json") == LENS
+    assert start(learn=False).lens == LENS
+
+
+def test_a_lens_of_pictures_that_are_turned_otherwise_is_refused(
+    start: Start, tmp_path: Path
+) -> None:
+    start().set_lens(LENS)
+    turned = start("picture.rotate=180", learn=False)
+    assert turned.condition == "unusable"
+    assert "turned by 180°, but the lens was calibrated with pictures" in turned.problem
+    with pytest.raises(CannotUseLens, match="turned by 180°"):
+        turned.set_lens(LENS)
+
+
+def test_no_tail_is_learned_beside_a_damaged_calibration(start: Start, tmp_path: Path) -> None:
+    start()
+    (tmp_path / "state" / "tail.lens.json").write_text("nonsense")
+    thread = start(learn=False)
+    assert thread.condition == "unusable"
+    with pytest.raises(Refused, match=r"tail.lens.json contains no calibration of a lens"):
+        thread.begin_learning()
+    thread.set_lens(LENS)
+    thread.begin_learning()
+    assert thread.condition == "learning"
 
 
 def test_each_camera_keeps_what_it_learned_in_a_file_of_its_own(

@@ -156,4 +156,8 @@ def test_several_runs_are_drawn_over_each_other(recordings: Path, tmp_path: Path
     assert fishctl(*words, "--from", "1", "--to", str(svg)).returncode == 0
     assert all(f"<!-- {text} -->" in svg.read_text() for text in ("slow", "fast", "tail beat (Hz)"))
     empty = write_experiment(tmp_path / "empty", "sweep", [])
-    assert "it contains no recording" in one_line(fishctl(*words, str(empty)))
+    drawn = fishctl(*words, str(empty), "--to", str(svg), "--force")
+    assert drawn.returncode == 0
+    assert "no recording: empty" in svg.read_text()
+    refused = one_line(fishctl("plot", str(empty), str(empty), "--to", str(svg), "--force"))
+    assert "nothing can be drawn: no recording in empty" in refused

@@ -116,7 +116,7 @@ def test_a_run_stays_in_the_trash_for_30_days(
         assert len(list_trash(folder)) == kept
 
 
-@pytest.mark.parametrize("verb", [("rename", "other"), ("delete",), ("delete", "--forever")])
+@pytest.mark.parametrize("verb", [("rename", "other"), ("delete",)])
 def test_a_run_in_progress_is_neither_renamed_nor_deleted(
     folder: Path, verb: tuple[str, ...]
 ) -> None:
@@ -145,6 +145,7 @@ NAMES = [
     "a/b",
     "a\nb",
     "a" * 101,
+    "x.part",
     "a\x1b",
 ]
 
@@ -187,7 +188,7 @@ def no_space(*_: object, **__: object) -> None:
 @pytest.mark.parametrize(
     ("part", "words", "said"),
     [
-        ("mkdir", ("delete", "first"), "'fishctl runs delete --forever' deletes it for ever"),
+        ("mkdir", ("delete", "first"), "'fishctl runs trash --empty' makes room"),
         ("rename", ("delete", "swept"), "swept cannot be moved"),
         ("rename", ("rename", "swept", "x"), "swept cannot be moved"),
         ("note", ("note", "first", "x"), "first.note.txt cannot be written"),
@@ -219,13 +220,6 @@ def test_a_trash_that_is_a_link_takes_nothing(
     (outside / "20000101-000000").mkdir()
     assert empty_trash(folder) == 0
     assert (outside / "20000101-000000").is_dir()
-
-
-def test_a_run_that_is_deleted_for_ever_leaves_nothing(folder: Path) -> None:
-    for run in ("first", "swept"):
-        runs(folder, "note", run, "x")
-        runs(folder, "delete", run, "--forever")
-    assert list(folder.iterdir()) == []
 
 
 def make_fifo(path: Path) -> None:

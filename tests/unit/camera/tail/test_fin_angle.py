@@ -4,8 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rigs.filmed_board import calibrate
 from rigs.filmed_tail import Film, backlash, random_motion
-from rigs.measured_tail import ASKED, BENDING, BESIDE, CASES, WEB, find_errors, learn, measure
+from rigs.measured_tail import (
+    ASKED,
+    ASKED_CALIBRATED,
+    BENDING,
+    BENT,
+    CASES,
+    WEB,
+    find_errors,
+    learn,
+    measure,
+)
 
 from fishd.camera.tail.learned import Learned
 
@@ -17,7 +28,7 @@ def learned() -> Learned:
     return learn(CASES["plain"])
 
 
-@pytest.mark.parametrize("case", [case for case in CASES if case != BESIDE])
+@pytest.mark.parametrize("case", [case for case in CASES if any(ASKED[case])])
 def test_its_errors_are_small(case: str) -> None:
     film = CASES[case]
     max_rms, max_error = ASKED[case]
@@ -29,6 +40,17 @@ def test_its_errors_are_small(case: str) -> None:
         assert 1e3 * errors.rms < max_rms
     if max_error is not None:
         assert 100 * abs(errors.alpha_max) < max_error
+
+
+@pytest.mark.parametrize("case", BENT)
+def test_a_calibrated_view_is_corrected(case: str) -> None:
+    film = CASES[case]
+    lens = calibrate(film)
+    errors = find_errors(film, measure(film, learn(film, lens), 5.0, 7.5))
+    assert errors.known > 0.95
+    assert errors.covered > 0.95
+    assert 1e3 * errors.rms < 2.0
+    assert 100 * abs(errors.alpha_max) < ASKED_CALIBRATED
 
 
 def test_its_uncertainty_is_that_of_the_waves() -> None:
