@@ -87,7 +87,7 @@ def _measure_faults(options: Namespace) -> Report:
         for film in FILMS:
             each = [outcomes[film, seed][fault] for seed in seeds]
             known, wrong = (100.0 * np.mean([x[index] for x in each]) for index in (0, 1))
-            told = max(x[2] for x in each)
+            told = max(0.0, *(x[2] for x in each))
             cells.append(f"{known:.0f} % / {wrong:.1f} %")
             if np.isfinite(told):
                 cells[-1] += f" / {told:.1f} s"

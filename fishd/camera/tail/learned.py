@@ -86,12 +86,9 @@ class Learned(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             max_length=STATIONS,
         ),
     ]
-    shift_error: Annotated[
-        tuple[float, float],
-        unit("px", "95 % of the pictures were shifted less along the rows, and down."),
-    ]
-    scene_turn_error: Annotated[
-        float, unit("rad", "95 % of the pictures were turned less against `background`.", ge=0)
+    pose_error: Annotated[
+        tuple[float, float, float],
+        note("95 % of the pictures were shifted less, along rows and down [px], and turned [rad]."),
     ]
     pixels_per_mm: Annotated[
         float | None, unit("px/mm", "Scale at the depth of the tail; null if unknown.")

@@ -112,12 +112,15 @@ class Learner:
         pictures = [picture for _, picture in self._pictures]
         scene = _Scene(pictures, self._size[0] / pictures[0].shape[1])
         traces = _trace_all(scene, pictures, self._lens)
-        return self._summarise(scene, times, traces, _find_poses(scene.ground, pictures))
+        return self._summarise(scene, times, traces, pictures)
 
     def _summarise(
-        self, scene: "_Scene", times: Array, traces: list[Trace | None], poses: Array
+        self,
+        scene: "_Scene",
+        times: Array,
+        traces: list[Trace | None],
+        pictures: list[Pixels],
     ) -> Learned:
-        """poses: of the camera, 95 % of the pictures have smaller ones"""
         seen = [trace for trace in traces if trace is not None]
         if len(seen) < 0.6 * len(traces):
             raise CannotLearn(
@@ -180,11 +183,10 @@ class Learner:
             shape_error=float(np.quantile(errors, 0.95)) * scale,
             direction_error=float(np.quantile(differences[:, 0], 0.95)),
             turn_error=float(np.quantile(differences[:, 1], 0.95)),
+            covariance=tuple(tuple(row.tolist()) for row in shape.covariance * scale**2),
+            pose_error=_find_pose_error(scene, pictures),
             lens=self._lens,
             pixels_per_mm=self._lens.pixels_per_mm if self._lens else None,
-            covariance=tuple(tuple(row.tolist()) for row in shape.covariance * scale**2),
-            shift_error=(float(poses[0]) * scale, float(poses[1]) * scale),
-            scene_turn_error=float(poses[2]),
         )
 
 
@@ -351,13 +353,13 @@ def _trace_all(scene: _Scene, pictures: list[Pixels], lens: Lens | None) -> list
     return [tracer.trace(picture) for picture in pictures]
 
 
-def _find_poses(ground: Ground, pictures: list[Pixels]) -> Array:
-    """Return the 95 % quantiles of shifts [px of these pictures] and turn [rad] of the scene."""
-    scene = Scene(ground)
+def _find_pose_error(scene: _Scene, pictures: list[Pixels]) -> tuple[float, float, float]:
+    """Return the 95 % quantiles of shifts [px of the whole picture] and turn [rad]."""
+    ground, still = scene.ground, Scene(scene.ground)
     small = [shrink(picture) for picture in pictures]
-    poses = [scene.find_pose(picture, ground.light(picture))[0] for picture in small]
-    quantiles = np.quantile(np.abs(poses), 0.95, axis=0)
-    return np.asarray(quantiles * (ground.scale, ground.scale, 1.0))
+    poses = [still.find_pose(picture, ground.light(picture))[0] for picture in small]
+    along, down, turn = np.quantile(np.abs(poses), 0.95, axis=0).tolist()
+    return ground.scale * scene.factor * along, ground.scale * scene.factor * down, turn
 
 
 def _stations(fin: tuple[float, float]) -> tuple[int, int]:

@@ -128,7 +128,7 @@ class TailMeter:
         )
         self._turns: deque[tuple[float, float, bool]] = deque()
         """Time, turn, and whether the fin is on the positive side."""
-        usual = _SCENE_USUAL * np.array([*learned.shift_error, learned.scene_turn_error])
+        usual = _SCENE_USUAL * np.array(learned.pose_error)
         shift = _MAX_SHIFT * width
         self._max_pose = np.maximum([shift, shift, _MAX_SCENE_TURN_RAD], usual)
         """Permitted shift along the rows and down [px], and turn [rad]."""
