@@ -11,15 +11,12 @@ from fishd.camera.messages import Crop, PublishedView
 from fishd.core.camera_frames import Pixels
 from fishd.core.errors import FishdError
 from fishd.core.files import write_atomically
-from fishd.core.tail_reading import TailReading
 
 Colours = NDArray[np.uint8]
 """Red, green and blue of each pixel, shape (height, width, 3)."""
 
 AXIS_COLOUR = (255, 90, 60)
 """Colour of the axis."""
-MIDLINE_COLOUR = (90, 255, 120)
-"""Colour of the midline of the tail."""
 CROP_COLOUR = (90, 200, 255)
 """Colour of the outline of the part that frames show."""
 _ENLARGED_SIZE_PX = 640
@@ -70,36 +67,12 @@ def draw_axis(colours: Colours, axis: Axis | None, size: int, crop: Crop | None 
     return drawn
 
 
-def draw_midline(colours: Colours, tail: TailReading | None, width: int) -> Colours:
-    """Return a whole picture with the midline of the tail drawn in.
-
-    tail: latest reading; None draws nothing
-    width: width of the pictures in whose pixels the midline is [px]
-    """
-    if tail is None or not tail.midline:
-        return colours
-    drawn = np.ascontiguousarray(colours)
-    scale = drawn.shape[1] / max(1, width)
-    points = (np.array(tail.midline) + 0.5) * scale - 0.5
-    cv2.polylines(
-        drawn, [np.rint(points * 16).astype(np.int32)], False, MIDLINE_COLOUR, 2, cv2.LINE_AA, 4
-    )
-    return drawn
-
-
 def decode_view(view: PublishedView) -> Colours:
     """Return the camera's whole picture; raises `FishdError` where it cannot be decoded."""
     grey = cv2.imdecode(np.frombuffer(view.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
     if grey is None:
         raise FishdError("the view that the camera sends is not a JPEG picture")
     return to_colours(np.asarray(grey, np.uint8))
-
-
-def encode_jpeg(colours: Colours) -> bytes:
-    """Return a picture as JPEG, with all its colours, so that thin lines keep theirs."""
-    sampling = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-    _, data = cv2.imencode(".jpg", _swap_red_and_blue(colours), sampling)
-    return data.tobytes()
 
 
 def write_png(path: Path, colours: Colours) -> None:

@@ -122,7 +122,8 @@ class CameraRequests:
             )
         raise CameraLost(
             f"no camera at {self.endpoint}: no answer within {timeout_s:g} s; start one with "
-            f"'fishd-camera', or name another with --camera or ${ENDPOINT_VARIABLE}"
+            f"'fishd-camera', or name another with --camera or ${ENDPOINT_VARIABLE}, for the page "
+            "with 'cameras' in its settings"
         )
 
     def _publishes(self) -> bool:

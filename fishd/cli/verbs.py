@@ -14,7 +14,7 @@ from fishd.core.console import complain
 from fishd.core.errors import install_command
 
 _EXTRAS = {
-    "aiohttp": "camera",
+    "aiohttp": "window",
     "bayes_opt": "lab",
     "cv2": "camera",
     "distributed": "cluster",

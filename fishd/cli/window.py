@@ -60,13 +60,13 @@ def _load_running(**values: Any) -> WindowSettings:
 
 @window.command("open")
 @window_options
-def open_page(**values: Any) -> int:
+def open_page(place: str = "", **values: Any) -> int:
     """Open the page in a browser; start it unless it runs."""
     settings = _load_running(**values)
     url = _local_url(settings)
     if not _answers(url):
-        exit_now(serve(settings, when_up=_show))
-    _show(url)
+        exit_now(serve(settings, when_up=lambda url: _show(f"{url}{place}")))
+    _show(f"{url}{place}")
     return 0
 
 

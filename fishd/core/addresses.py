@@ -25,7 +25,7 @@ ADDRESS_FORM = "tcp://HOST:PORT or ipc://PATH is needed"
 ENDPOINT_VARIABLE = "FISHD_ENDPOINT"
 KEYS_VARIABLE = "FISHD_KEYS"
 ADDRESS_IN_USE = "it is in use, by another fishd perhaps; end that, or choose another address"
-_SERVICE_SOCKET = Path("/run/fishd/control")
+SERVICE_SOCKET = Path("/run/fishd/control")
 _MAX_PENDING_CONNECTIONS = 128
 """Maximum number of connections that wait to be accepted."""
 
@@ -183,16 +183,16 @@ def find_control_address() -> str:
         return endpoint
     own = _private_socket("control")
     # A daemon that was killed leaves its socket behind.
-    if _may_exist(_SERVICE_SOCKET) and (
+    if _may_exist(SERVICE_SOCKET) and (
         unix_sockets.is_deserted(own) or unix_sockets.find_trust_problem(own)
     ):
-        return f"ipc://{_SERVICE_SOCKET}"
+        return f"ipc://{SERVICE_SOCKET}"
     return f"ipc://{own}"
 
 
 def is_default_address(address: str) -> bool:
     """Return whether clients find a fishd at this address without being given one."""
-    return address in (f"ipc://{_SERVICE_SOCKET}", f"ipc://{_private_socket('control')}")
+    return address in (f"ipc://{SERVICE_SOCKET}", f"ipc://{_private_socket('control')}")
 
 
 def _may_exist(path: Path) -> bool:

@@ -18,8 +18,8 @@ from fishd.client.zmq_sockets import Subscription, connect_subscriber
 from fishd.core import text
 from fishd.core.addresses import find_control_address
 from fishd.core.decoding import decoder
-from fishd.core.errors import FishError, LeaseLost
-from fishd.core.protocol import PolicyInfo
+from fishd.core.errors import FishError, LeaseLost, Refused
+from fishd.core.protocol import Calibrations, PolicyInfo
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
 from fishd.window.estop_path import EstopPath
 from fishd.window.live import encode_message
@@ -328,6 +328,15 @@ class FishLink:
         """Return the named policies of fishd; raise `FishError`."""
         with self._waiting_request():
             return await self._fish.policies()
+
+    async def read_settings(self) -> tuple[dict[str, Any], Calibrations | None]:
+        """Return configuration and calibrations of fishd, None without any; raise `FishError`."""
+        with self._waiting_request():
+            settings = await self._fish.config()
+            try:
+                return settings, await self._fish.calibrations()
+            except Refused:
+                return settings, None
 
     @contextmanager
     def _waiting_request(self) -> Iterator[None]:

@@ -244,12 +244,12 @@ class MetricsRequests:
         """Return the disk of the runs; None if it does not answer in time."""
         if self._reading is None or self._reading.done():
             loop = asyncio.get_running_loop()
-            self._reading = loop.run_in_executor(self._disk, _measure_disk, self._runs)
+            self._reading = loop.run_in_executor(self._disk, measure_disk, self._runs)
         done, _ = await asyncio.wait([self._reading], timeout=DISK_TIMEOUT_S)
         return next(iter(done)).result() if done else None
 
 
-def _measure_disk(folder: Path) -> Disk | None:
+def measure_disk(folder: Path) -> Disk | None:
     """Return the disk of a folder, which may not exist yet; None if it cannot be read."""
     try:
         usage = shutil.disk_usage(next(p for p in (folder, *folder.parents) if p.exists()))

@@ -36,6 +36,13 @@ class WindowSettings(Struct, frozen=True, forbid_unknown_fields=True):
     fish: Annotated[
         dict[str, str], note("Control socket of each fish, by its name; empty for this machine's.")
     ] = {}
+    cameras: Annotated[
+        dict[str, str],
+        note(
+            "Address of the requests of the camera above each fish, by the name of the fish; "
+            "empty: $FISHD_CAMERA, else that of this machine, above the first fish."
+        ),
+    ] = {}
     names: Annotated[
         tuple[str, ...],
         note("Further host names of this machine for browsers, such as that of a reverse proxy."),
@@ -68,6 +75,11 @@ class WindowSettings(Struct, frozen=True, forbid_unknown_fields=True):
     def endpoints(self) -> dict[str, str | None]:
         """Control socket of each fish, by its name; None for the fishd of this machine."""
         return {**self.fish} or {"fish": None}
+
+    @property
+    def camera_addresses(self) -> dict[str, str | None]:
+        """Address of the camera above each fish with one; None for the camera of this machine."""
+        return {**self.cameras} or {next(iter(self.endpoints)): None}
 
     @property
     def state_folder(self) -> Path:
@@ -120,6 +132,12 @@ def _check(settings: WindowSettings) -> None:
             )
         if complaint := find_connect_problem(endpoint):
             raise Problem(("fish", name), f"'{endpoint}' is not valid: {complaint}")
+    for name, address in settings.cameras.items():
+        if name not in settings.endpoints:
+            known = ", ".join(settings.endpoints)
+            raise Problem(("cameras", name), f"is not the name of a fish; here: {known}")
+        if complaint := find_connect_problem(address):
+            raise Problem(("cameras", name), f"'{address}' is not valid: {complaint}")
     for origin in settings.origins:
         if not _ORIGIN.fullmatch(origin):
             raise Problem(

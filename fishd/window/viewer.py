@@ -20,6 +20,8 @@ class Viewer:
 
     OPCODE = WSMsgType.BINARY
     """Kind of the messages that are bytes."""
+    kind = "page"
+    """What it is; those of each kind are counted apart."""
     address = ""
     """Address of the page."""
     device_id = ""

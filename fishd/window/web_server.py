@@ -26,9 +26,9 @@ from fishd.window.viewer import CLOSE_TIMEOUT_S, Viewer
 log = logging.getLogger(__name__)
 
 MAX_VIEWERS = 16
-"""Largest number of WebSockets that are served at a time."""
+"""Largest number of WebSockets of one kind that are served at a time."""
 MAX_VIEWERS_PER_ADDRESS = 12
-"""Largest number of WebSockets of one address."""
+"""Largest number of these of one address."""
 BACKLOG = 1024
 """Number of connections that the kernel keeps until they are admitted."""
 REFUSAL_DELAY_S = 1.0
@@ -159,11 +159,12 @@ class WebServer:
     ) -> web.StreamResponse:
         """Serve a WebSocket until the page or the server closes it."""
         viewer.address = request.remote or ""
-        own = sum(other.address == viewer.address for other in self.viewers)
-        if len(self.viewers) >= MAX_VIEWERS or own >= MAX_VIEWERS_PER_ADDRESS:
+        others = [other for other in self.viewers if other.kind == viewer.kind]
+        own = sum(other.address == viewer.address for other in others)
+        if len(others) >= MAX_VIEWERS or own >= MAX_VIEWERS_PER_ADDRESS:
             await asyncio.sleep(REFUSAL_DELAY_S)
             raise web.HTTPServiceUnavailable(
-                text=f"{len(self.viewers)} pages are open already, {own} of them from "
+                text=f"{len(others)} {viewer.kind}s are open already, {own} of them from "
                 f"{viewer.address}; close one of them\n"
             )
         sock = web.WebSocketResponse(

@@ -12,9 +12,11 @@ from msgspec import Raw
 
 from fishd.core import text
 from fishd.window.access import AccessControl
-from fishd.window.answers import answer_in_json
+from fishd.window.answers import ApiError, answer_in_json
+from fishd.window.camera_feed import CameraFeed
 from fishd.window.fish_requests import FishRequests
 from fishd.window.foxglove import PROTOCOLS
+from fishd.window.inspection import InspectionRequests
 from fishd.window.job_requests import JobRequests
 from fishd.window.jobs import Jobs
 from fishd.window.live import encode
@@ -37,6 +39,7 @@ class WindowServer(WebServer):
     def __init__(self, settings: WindowSettings) -> None:
         """Raises `DeviceError` where the state folder cannot be used."""
         access = AccessControl(PairedDevices(settings.state_folder), settings.pair_all)
+        self._access = access
         self._settings, self._register = settings, Register(settings.state_folder)
         self._jobs = Jobs(
             settings.runs_folder,
@@ -52,16 +55,24 @@ class WindowServer(WebServer):
             lambda: self.viewers,
             self._jobs.stop_without_access,
         )
+        self._cameras = {
+            name: CameraFeed(address, self._pages.links[name])
+            for name, address in settings.camera_addresses.items()
+        }
         job_requests = JobRequests(access, self._pages, self._jobs)
         host, port = settings.address
         routes = [
             *file_routes(resources.files(__package__).joinpath("page"), "index.html"),
             web.get("/live", self._serve_live),
             web.get("/foxglove", self._serve_foxglove),
+            web.get("/camera", self._serve_camera),
             *access.routes,
             *FishRequests(access, self._pages).routes,
             *job_requests.routes,
             *QueueRequests(access, self._pages, job_requests).routes,
+            *InspectionRequests(
+                access, self._pages, self._jobs.runs, settings.camera_addresses
+            ).routes,
             *MetricsRequests(access, self._pages.links, settings.runs_folder).routes,
         ]
         super().__init__(
@@ -103,6 +114,14 @@ class WindowServer(WebServer):
     async def _serve_live(self, request: web.Request) -> web.StreamResponse:
         with self._pages.open_live(request) as page:
             return await self.serve_viewer(request, page)
+
+    async def _serve_camera(self, request: web.Request) -> web.StreamResponse:
+        access = self._access.require(request, "watch")
+        name = self._pages.find_link(request.query.get("fish", next(iter(self._pages.links)))).name
+        if name not in self._cameras:
+            raise ApiError(404, "no-camera", f"no camera is above {name}", "add it to 'cameras'")
+        with self._cameras[name].open(access.device_id) as viewer:
+            return await self.serve_viewer(request, viewer)
 
     async def _serve_foxglove(self, request: web.Request) -> web.StreamResponse:
         with self._pages.open_foxglove(request) as page:

@@ -34,6 +34,9 @@ def go(page: Page, place: str) -> None:
     """Show a part of the page: `live`, `experiments`, `runs` or `fish`."""
     page.click(f"#places a[href='#{place}']")
     expect(page.locator(f"main[data-place={place}]")).to_be_visible()
+    if place == "fish":
+        expect(page.locator("#configuration table")).to_be_visible()
+    expect(page.get_by_text("Loading …")).to_have_count(0)
 
 
 def swim(page: Page, controller: str = "swing") -> None:

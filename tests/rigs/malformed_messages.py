@@ -12,8 +12,9 @@ LANES = 8
 """Number of attackers at a time."""
 FRAMES_PER_CONNECTION = 20
 PATHS = (
-    "/", "/live", "/foxglove", "/api/session", "/api/pair", "/api/unpair", "/api/fish", "/api/jobs",
-    "/api/runs", "/api/fish/fish/drive", "/api/fish/fish/request",
+    "/", "/live", "/foxglove", "/camera", "/api/session", "/api/pair", "/api/unpair", "/api/fish",
+    "/api/jobs", "/api/runs", "/api/fish/fish/drive", "/api/fish/fish/request",
+    "/api/fish/fish/about/log", "/api/fish/fish/doctor",
     "/api/jobs/1/stop", "/api/runs/a/plot.png", "/vendor/manifest.json", "/metrics", "/none",
 )  # fmt: skip
 BODIES = (
@@ -81,7 +82,9 @@ def wrong_frames(chance: random.Random, port: int) -> bytes:
         b"GET %s HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
         b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
     )
-    path = chance.choice((b"/live", b"/foxglove", b"/live?fish=none", b"/live?client=%ff"))
+    path = chance.choice(
+        (b"/live", b"/foxglove", b"/camera", b"/live?fish=none", b"/live?client=%ff")
+    )
     frames = [
         _frame(0x81, chance.choice((*BODIES[:16], b'["seen",1]', b'{"op":"subscribe"}'))[:900])
         for _ in range(FRAMES_PER_CONNECTION - 1)

@@ -32,14 +32,15 @@ class WindowProcess(Process):
         self, folder: Path, *arguments: str, changes: str = "", settings: str = "", **fish: str
     ) -> None:
         """
-        folder: for paired devices and runs
+        folder: for paired devices, runs, and the camera above the first fish
         changes: Python code that runs first, such as a shorter timeout
         settings: further lines of its settings
         fish: control sockets by the name of the fish
         """
         self.state = folder / "window"
         config = folder / "window.yaml"
-        config.write_text(f"runs: {folder}/runs\nnames: [{NETWORK_HOST}]\n{settings}\n")
+        camera = f"cameras: {{{next(iter(fish))}: ipc://{folder}/camera-requests}}" if fish else ""
+        config.write_text(f"runs: {folder}/runs\nnames: [{NETWORK_HOST}]\n{camera}\n{settings}\n")
         options = ("--config", str(config), "--state", str(self.state), "--listen", "127.0.0.1:0")
         pairs = [word for name, where in fish.items() for word in ("--fish", f"{name}={where}")]
         code = f"{changes}\nfrom fishd.__main__ import fishd_window; fishd_window()"

@@ -9,7 +9,7 @@ VERBS = {
         "status": Verb("camera.look", "status", "Show the state of the camera."),
         "view": Verb("camera.look", "view", "Show its picture in the terminal, or write a PNG."),
         "measure": Verb("camera.measure", "measure", "Show the fin angle, or learn the tail."),
-        "page": Verb("camera.page", "page", "Show its picture live on a web page."),
+        "page": Verb("camera.page", "page", "Show its picture on the page of the fish."),
     },
     "Set up": {
         "align": Verb("camera.align", "align", "Find the axis of motion, and how to turn it."),

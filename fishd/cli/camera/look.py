@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from fishd.camera.client import CameraClient
     from fishd.camera.drawing import Colours
     from fishd.camera.messages import CameraState
-    from fishd.core.tail_reading import TailReading
 
 ANSWER_TIMEOUT_S = 2.0
 """Longest wait for an answer [s]."""
@@ -239,10 +238,8 @@ def _read_for(client: "CameraClient", watch: "AxisWatch", seconds: float) -> Non
         watch.find()
 
 
-def draw_picture(
-    client: "CameraClient", watch: "AxisWatch", whole: bool, tail: "TailReading | None" = None
-) -> "Colours":
-    """Return the latest picture with the axis, and with the midline of the tail in a whole one.
+def draw_picture(client: "CameraClient", watch: "AxisWatch", whole: bool) -> "Colours":
+    """Return the latest picture with the axis.
 
     whole: that of the camera, not only the crop
     """
@@ -254,8 +251,7 @@ def draw_picture(
         if client.view is None:
             raise FishdError("the camera sends no views: publish.view_rate of its settings is 0")
         colours, crop = drawing.decode_view(client.view), client.view.header.crop
-        drawn = drawing.draw_axis(colours, watch.axis, len(pixels), crop)
-        return drawing.draw_midline(drawn, tail, client.state.picture_width)
+        return drawing.draw_axis(colours, watch.axis, len(pixels), crop)
     return drawing.draw_axis(drawing.to_colours(pixels), watch.axis, len(pixels))
 
 

@@ -2,6 +2,7 @@
 
 import ctypes
 import getpass
+import re
 import resource
 import subprocess
 
@@ -55,6 +56,10 @@ def memory(context: Context) -> Result:
     """Check that memory may be locked, so that no tick waits for the disk."""
     if not context.config.realtime.lock_memory:
         return ok("not to be locked (realtime.lock_memory: false)")
+    if context.running:
+        state = context.text(f"/proc/{context.running.status.pid}/status")
+        if re.search(r"^VmLck:\s+[1-9]", state, re.MULTILINE):
+            return ok("the running fishd has locked its memory")
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     capabilities = [
         int(line.split()[1], 16)

@@ -2,6 +2,8 @@
 import {
   call, duration, forceUnit, html, number, parametersText, recall, remember, render, sentence, setClient, timeOfDay, useState,
 } from "./common.js";
+import { About } from "./about.js";
+import { Camera } from "./camera.js";
 import { ChartTools, MarkForm } from "./chart_tools.js";
 import { Charts } from "./charts.js";
 import { Drive, driverName, request } from "./controls.js";
@@ -37,7 +39,7 @@ const state = {
   name: "", fish: [], session: null, status: null, controllers: [], events: [], jobs: new Map(),
   connection: null, driver: null, linked: false, helloed: false, refused: "", lastTick: null, tick: null, interval: 0.05,
   changedSeq: 0, own: new Set(), selected: null, edited: null, keep: recall("keep", false), estop: null,
-  notices: [], reference: null, heard: performance.now(),
+  notices: [], reference: null, isCameraOpen: recall("camera", false), heard: performance.now(),
 };
 let ring = new Ring(0.05), charts, view, stream, drawing = false, valuesAt = 0, later = 0;
 /** Number of connections in a row that ended without a first message. */
@@ -469,6 +471,9 @@ function renderAll() {
   renderHead();
   render(html`<${Places} />`, byId("places"));
   renderValues();
+  render(state.name && state.isCameraOpen ? html`<${Camera} fish=${state.name} close=${() => showCamera(false)} />` : null, byId("camera"));
+  byId("show-camera").hidden = state.isCameraOpen;
+  render(state.place === "fish" && state.name ? html`<${About} fish=${state.name} isPaired=${state.session?.paired} />` : null, byId("about"));
   render(html`<${Banner} />`, byId("banner"));
   render(html`<${Drive} ...${shared} />`, byId("drive"));
   render(html`<${ChartTools} ...${{ charts, shownName }} />`, byId("chart-head"));
@@ -477,6 +482,13 @@ function renderAll() {
   render(html`<${Runs} ...${shared} />`, byId("runs"));
   render(html`<${Events} />`, byId("events"));
   render(html`<${Notices} />`, byId("notices"));
+}
+
+function showCamera(isOpen) {
+  state.isCameraOpen = isOpen;
+  remember("camera", isOpen);
+  renderAll();
+  if (!isOpen) byId("show-camera").focus();
 }
 
 let renderNeeded = false, saidMode = "";
@@ -522,7 +534,8 @@ function drawFrame(now) {
 function buildStaticParts() {
   render(html`<h2 id="view-title" class="unseen">From above</h2><canvas id="fish" role="img"
       aria-label="The fish from above; its tail shows the command, and the true fin if it is simulated"></canvas>
-    <p class="keys"><span class="key-phi">command φ<sub>c</sub></span><span class="key-body" id="tail-key">tail</span></p>`, byId("view"));
+    <p class="keys"><span class="key-phi">command φ<sub>c</sub></span><span class="key-body" id="tail-key">tail</span></p>
+    <p class="keys"><button type="button" class="link" id="show-camera" onClick=${() => showCamera(true)}>show the camera</button></p>`, byId("view"));
   view = new TopView(byId("fish"));
   const banner = byId("banner"), header = document.querySelector("header");
   const noteHeights = new ResizeObserver(() => {
@@ -542,6 +555,7 @@ function followAddress() {
     state.invitation = token;
     history.replaceState(null, "", location.pathname + location.search);
   }
+  if (location.hash === "#camera") state.isCameraOpen = true; // from `fishctl camera page`
   const place = PLACES[location.hash.slice(1)] ? location.hash.slice(1) : "live";
   state.place = place;
   for (const section of byId("main").children) section.hidden = !section.dataset.places.split(" ").includes(place);

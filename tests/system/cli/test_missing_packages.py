@@ -114,7 +114,7 @@ NOT_INSTALLED = r"fishctl: %s is not installed; [^\n]*\[%s\]'\n"
         ("simulate hold --set robot=virtual-pi", MODULES, ONE_LINE % "adafruit-extended-bus"),
         ("agent default-fish", ["onnx"], NOT_INSTALLED % ("onnx", "policy")),
         ("agent default-fish", ["onnxruntime"], NOT_INSTALLED % ("onnxruntime", "policy")),
-        ("camera page", ["aiohttp"], NOT_INSTALLED % ("aiohttp", "camera")),
+        ("camera page --listen 127.0.0.1:0", ["aiohttp"], r"fishd-window: [^\n]*\[window\]'\n"),
         ("record run", ["mcap"], NOT_INSTALLED % ("mcap", "record")),
     ],
 )

@@ -104,7 +104,7 @@ def test_a_planted_folder_hides_no_service(shared: Path, monkeypatch: pytest.Mon
     (run / "fishd").mkdir(parents=True)
     run.chmod(0o755)
     os.chown(run / "fishd", USER, USER)
-    monkeypatch.setattr(addresses, "_SERVICE_SOCKET", run / "fishd" / "control")
+    monkeypatch.setattr(addresses, "SERVICE_SOCKET", run / "fishd" / "control")
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(session))
     with user(OTHER_USER):
         session.mkdir()

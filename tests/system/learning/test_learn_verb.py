@@ -70,6 +70,14 @@ def test_a_run_a_resume_and_a_run_that_begins_with_its_networks(
     assert note.startswith("began with ppo-20")
 
 
+def test_the_result_of_a_training_is_printed_as_json(tmp_path: Path, settings: str) -> None:
+    folder = str(tmp_path / "run")
+    done = learn("ppo", "--settings", settings, "--steps", "64", "--folder", folder, "--json")
+    assert done.returncode == 0, done.stderr
+    result = msgspec.json.decode(done.stdout)
+    assert (result["folder"], result["steps"], result["ended"]) == (folder, 64, "finished")
+
+
 def test_mistakes_are_one_line(tmp_path: Path) -> None:
     folder = str(tmp_path / "run")
     (tmp_path / "wrong.yaml").write_text("ppo:\n  gama: 0.9\n", encoding="utf-8")

@@ -23,6 +23,9 @@ from rigs.window_process import (
 from fishd.window import devices
 from fishd.window.devices import DeviceError, Devices
 
+PARTS = "computer", "disk", "settings", "camera", "log"
+"""What a page reads about a fish and its computer."""
+
 
 def token_of(link: str) -> str:
     """Return the token in a link that pairs."""
@@ -39,10 +42,10 @@ async def paired(window: WindowProcess, scope: str, name: str) -> AsyncIterator[
         yield browser
 
 
-async def refuse_page(browser: Browser) -> int:
+async def refuse_page(browser: Browser, path: str = "/live") -> int:
     """Return the status with which a page is refused."""
     with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
-        async with browser.session.ws_connect("/live"):
+        async with browser.session.ws_connect(path):
             pass
     return refusal.value.status
 
@@ -51,12 +54,16 @@ async def test_a_device_that_is_not_paired_gets_only_the_page(window: WindowProc
     async with Browser(window.url, NETWORK_HOST) as browser:
         session = await browser.get("/api/session")
         assert (session["paired"], session["scope"], session["device"]) == (False, None, None)
-        for path in ("fish", "fish/fish/policies", "fish/fish/queue", "forms", "jobs", "runs"):
+        about = (f"fish/fish/about/{part}" for part in PARTS)
+        for path in (
+            *("fish", "fish/fish/policies", "fish/fish/queue", "forms", "jobs", "runs"),
+            *about,
+        ):
             assert await browser.refusal(f"/api/{path}") == (401, "not-paired")
-        for path in ("estop", "drive", "release", "request", "queue"):
+        for path in ("estop", "drive", "release", "request", "queue", "doctor"):
             assert await browser.refusal(f"/api/fish/fish/{path}", {}) == (401, "not-paired")
         assert await browser.refusal("/api/jobs", {}) == (401, "not-paired")
-        assert await refuse_page(browser) == 401
+        assert await refuse_page(browser) == await refuse_page(browser, "/camera") == 401
 
 
 async def test_a_token_pairs_one_device_and_no_second_one(window: WindowProcess) -> None:
@@ -91,6 +98,9 @@ async def test_a_device_that_may_watch_sees_the_fish_stops_it_and_nothing_more(
         checked = await page.post("/api/jobs/check", body)
         assert (checked["problem"], checked["plan"]) == ("", None)  # it starts no process
         assert "measure" in [form["kind"] for form in await browser.get("/api/forms")]
+        for part in PARTS:
+            await browser.get(f"/api/fish/fish/about/{part}")
+        assert await page.post("doctor")
         assert (await page.post("estop"))["way"] == "control"
     async with Browser(window.url) as browser, open_page(browser) as page:
         await page.drive()
@@ -229,10 +239,11 @@ def test_the_file_is_written_after_its_copy(tmp_path: Path) -> None:
     assert paired.read_copy() == ()
 
 
-async def test_a_revoked_device_loses_its_foxglove_too(window: WindowProcess) -> None:
+@pytest.mark.parametrize("path", ["/foxglove", "/camera"])
+async def test_a_revoked_device_loses_its_other_views_too(window: WindowProcess, path: str) -> None:
     async with paired(window, "watch", "viewer") as browser:
         options = {"protocols": ["foxglove.sdk.v1"]}
-        async with browser.session.ws_connect("/foxglove", **options) as sock:
+        async with browser.session.ws_connect(path, **options) as sock:
             await sock.receive_str()
             window.ask("revoke", "viewer")
             while not sock.closed:

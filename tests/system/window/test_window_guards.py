@@ -30,6 +30,7 @@ CHANGES = [
     ("/api/fish/fish/drive", {"take": True}),
     ("/api/fish/fish/release", {}),
     ("/api/fish/fish/request", {"op": "set-controller", "args": {"name": "square"}}),
+    ("/api/fish/fish/doctor", {}),
     ("/api/fish/fish/queue", {"op": "clear"}),
     ("/api/jobs", {"fish": "fish", "kind": "record"}),
     ("/api/jobs/check", {"fish": "fish", "kind": "record"}),
@@ -53,14 +54,16 @@ async def test_no_name_that_leads_here_but_is_not_ours_gets_anything(
             "Host": authority, "Origin": f"http://{authority}",
             "X-Client": page.hello["client"],
         }  # fmt: skip
-        for path in ("/", "/api/session", "/api/fish", "/api/forms", "/metrics"):
+        about = "/api/fish/fish/about/log"
+        for path in ("/", "/api/session", "/api/fish", about, "/api/forms", "/metrics"):
             async with browser.session.get(path, headers=headers) as response:
                 assert response.status == 403
         for path, body in CHANGES:
             assert await browser.refusal(path, body, headers=headers) == (403, "forbidden")
-        with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
-            await browser.session.ws_connect("/live", headers=headers)
-        assert refusal.value.status == 403
+        for path in ("/live", "/camera"):
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
+                await browser.session.ws_connect(path, headers=headers)
+            assert refusal.value.status == 403
     assert daemon.status().mode == "idle"
 
 
@@ -74,9 +77,10 @@ async def test_no_page_of_another_origin_changes_or_sees_anything(
         headers = {"Origin": foreign, "X-Client": page.hello["client"]}
         for path, body in CHANGES:
             assert await browser.refusal(path, body, headers=headers) == (403, "forbidden")
-        with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
-            await browser.session.ws_connect("/live", headers=headers)
-        assert refusal.value.status == 403
+        for path in ("/live", "/camera"):
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
+                await browser.session.ws_connect(path, headers=headers)
+            assert refusal.value.status == 403
     assert daemon.status().mode == "idle"
 
 
@@ -100,7 +104,8 @@ async def test_another_site_starts_no_reading_either_where_the_browser_tells(
             headers = {"Sec-Fetch-Site": site}
             for path in (
                 *("/api/runs", "/api/trash", "/api/results?run=x", "/api/runs/x/download/all.zip"),
-                *("/api/fish/fish/queue", "/api/forms", "/metrics"),
+                *("/api/fish/fish/queue", "/api/fish/fish/about/log", "/api/forms", "/metrics"),
+                "/camera",
             ):
                 refused = await browser.refusal(path, headers=headers)
                 assert refused == (403, "other-origin")

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import APIResponse, Page, Route, expect
 from rigs.browser import needs_browser, open_page, shared_browser
+from rigs.camera_process import running_camera
 from rigs.live_page import RESOLVED, go, live_page, name_device, swim
 from rigs.processes import Daemon, running, wait_until
 from rigs.recordings import record_run, swum
@@ -71,6 +72,19 @@ FIND_BARRIERS = """async () => {
     if (!wasGrey) return violations;
   }
 }"""
+
+
+FIND_RED_ROW = """() => {
+  const canvas = document.querySelector("#camera canvas"), { width, height } = canvas;
+  const copy = new OffscreenCanvas(1, height).getContext("2d");
+  copy.drawImage(canvas, -Math.floor(width / 2), 0);
+  const data = copy.getImageData(0, 0, 1, height).data;
+  const rows = [];
+  for (let row = 0; row < height; row++)
+    if (data[4 * row] > 200 && data[4 * row + 2] < 120) rows.push(row);
+  return rows.length ? rows.reduce((sum, row) => sum + row, 0) / rows.length / height : null;
+}"""
+"""Returns the height of the axis in the middle column, as a fraction; null without."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -332,6 +346,52 @@ def test_a_reload_restores_what_the_fish_does_and_the_first_tab_leads_to_the_eme
         expect(page.locator("#estop-ms")).to_be_visible()
         go(page, "fish")
         expect(page.locator("#events")).to_contain_text("swing takes over")
+        assert complaints == []
+
+
+def test_the_tile_of_the_camera_draws_picture_and_axis_only_while_it_is_on_the_screen(
+    daemon: Daemon, window: WindowProcess
+) -> None:
+    settings = (f"simulated.fishd={daemon.endpoint}", "simulated.rate=30", "simulated.off_axis=3.0")
+    with (
+        running_camera(window.state.parent, *settings),
+        live_page(window.url) as (page, complaints),
+    ):
+        page.goto(f"{window.url}/#camera")
+        swim(page)
+        tile = page.locator("#camera")
+        expect(tile).to_contain_text("Streaming: a simulated camera above the fish")
+        page.get_by_label("show how it is aligned").check()
+        expect(tile).to_contain_text("px below the middle row")
+        wait_until(lambda: page.evaluate(FIND_RED_ROW) is not None)
+        row = page.evaluate(FIND_RED_ROW)
+        assert row == pytest.approx((83 / 2 + 3.0 + 0.5) / 84, abs=2 / 84)
+        with page.expect_websocket() as opened:
+            go(page, "fish")
+            go(page, "live")
+        expect(page.locator("#show-camera")).to_be_hidden()
+        socket = opened.value
+        tile.get_by_role("button", name="Close").click()
+        wait_until(lambda: page.evaluate("0") == 0 and socket.is_closed())
+        expect(tile).to_be_empty()
+        expect(page.locator("#show-camera")).to_be_focused()
+        assert complaints == []
+
+
+def test_the_part_fish_shows_computer_settings_log_and_checks(window: WindowProcess) -> None:
+    with live_page(window.url) as (page, complaints):
+        go(page, "fish")
+        expect(page.locator("#computer")).to_contain_text(re.compile(r"robot simulated.*GB free"))
+        expect(page.locator("#calibrations")).to_contain_text("This robot has none")
+        keys = page.locator("#configuration tbody tr")
+        own = keys.count()
+        expect(page.locator("#configuration")).to_contain_text("control.address")
+        page.locator("#configuration input").check()
+        expect(page.locator("#configuration")).to_contain_text("amplitude_limit")
+        assert keys.count() > own
+        expect(page.locator("#log")).to_contain_text("not the service of this computer")
+        page.click("#checks button")
+        expect(page.locator("#checks")).to_contain_text("daemon")
         assert complaints == []
 
 
@@ -651,6 +711,7 @@ def test_the_memory_of_the_page_is_the_same_after_a_day_of_ticks(window: WindowP
 def test_the_keyboard_reaches_everything_and_the_focus_is_visible(window: WindowProcess) -> None:
     with live_page(window.url) as (page, _):
         swim(page)
+        page.click("#show-camera")
         complete = {"experiments": "#preview code", "runs": "#runs .complete", "fish": "#events ol"}
         for place in ("live", *complete):
             go(page, place)
@@ -704,6 +765,7 @@ def test_nothing_is_wider_than_the_screen_and_the_emergency_stop_keeps_its_place
             assert box
             assert box["x"] + box["width"] > width - 20
             swim(page)
+            show_camera(page)
             for place in ("experiments", "runs", "fish", "live"):
                 go(page, place)
                 page.evaluate("scrollTo(0, 600)")
@@ -719,6 +781,10 @@ def test_no_barrier_is_serious(window: WindowProcess) -> None:
     with live_page(window.url, bypass_csp=True) as (page, _):
         page.evaluate(AXE.read_text(encoding="utf-8"))
         swim(page)
+        show_camera(page)
+        go(page, "fish")
+        page.click("#checks button")
+        expect(page.locator("#checks tbody tr").first).to_be_visible()
         for width in (1280, 800, 390):
             page.set_viewport_size({"width": width, "height": 844})
             for place in ("experiments", "runs", "fish", "live"):
@@ -732,6 +798,13 @@ def test_no_barrier_is_serious(window: WindowProcess) -> None:
         page.click("#estop")
         expect(page.locator("#latched")).to_be_visible()
         refuse_barriers(page)
+
+
+def show_camera(page: Page) -> None:
+    """Open the tile of the camera; no camera is there, and the tile says so."""
+    if page.locator("#show-camera").is_visible():
+        page.click("#show-camera")
+    expect(page.locator("#camera .note")).to_contain_text("No camera at")
 
 
 def refuse_barriers(page: Page) -> None:

@@ -10,9 +10,12 @@ from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line, wait_unt
 from rigs.window_process import Browser, WindowProcess, open_page, running_window
 
 
-def test_a_page_that_runs_is_opened_and_not_started_again(window: WindowProcess) -> None:
-    done = fishctl("window", "open", "--listen", f"127.0.0.1:{window.port}")
-    assert (done.returncode, done.stdout) == (0, f"the fish is at {window.url}/\n")
+@pytest.mark.parametrize(("verb", "place"), [("window open", ""), ("camera page", "#camera")])
+def test_a_page_that_runs_is_opened_and_not_started_again(
+    window: WindowProcess, verb: str, place: str
+) -> None:
+    done = fishctl(*verb.split(), "--listen", f"127.0.0.1:{window.port}")
+    assert (done.returncode, done.stdout) == (0, f"the fish is at {window.url}/{place}\n")
 
 
 async def test_a_page_that_does_not_run_is_started_until_ctrl_c(
@@ -50,11 +53,19 @@ def test_a_wrong_option_is_one_line(tmp_path: Path, words: list[str], complaint:
     assert errors.count("\n") == 1
 
 
-def test_a_wrong_key_is_named_with_its_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ("fishes: {}", "fishes: unknown key; did you mean 'fish'?"),
+        ("cameras: {tuna: ipc:///x}", "cameras.tuna: is not the name of a fish; here: fish"),
+        ("cameras: {fish: /dev/video0}", "'/dev/video0' is not valid: tcp://HOST:PORT or ipc://"),
+    ],
+)
+def test_a_wrong_key_is_named_with_its_line(tmp_path: Path, line: str, complaint: str) -> None:
     file = tmp_path / "window.yaml"
-    file.write_text("listen: 127.0.0.1:8880\nfishes: {}\n")
-    line = one_line(fishctl("window", "devices", "--config", str(file)))
-    assert re.search(r"window\.yaml:2: fishes: unknown key; did you mean 'fish'\?", line)
+    file.write_text(f"listen: 127.0.0.1:8880\n{line}\n")
+    shown = one_line(fishctl("window", "devices", "--config", str(file)))
+    assert f"window.yaml:2: {complaint}" in shown
 
 
 async def test_the_end_of_the_window_stops_its_fish_and_its_experiments(

@@ -24,7 +24,7 @@ def policy_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.delenv("FISHD_ENDPOINT", raising=False)
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr("fishd.core.addresses._SERVICE_SOCKET", tmp_path / "service")
+    monkeypatch.setattr("fishd.core.addresses.SERVICE_SOCKET", tmp_path / "service")
     monkeypatch.setattr(library, "folders", lambda: [folder])
     return folder
 

@@ -1,1 +1,0 @@
-"""The page of the camera: what it sees, live, with the axis of motion."""
