@@ -97,8 +97,8 @@ export function Runs(page) {
           const id = idOf(run), isOpen = open === id;
           return html`<${Line} key=${id} run=${run} isOpen=${isOpen} isPicked=${picked.includes(id)} pick=${pick(id)}
               toggle=${() => setOpen(isOpen ? null : id)} />
-            ${isOpen && html`<tr key=${`${id}/`} class="plot-row"><td colspan="9"><${Run} run=${run} page=${page} changed=${changed}
-              open=${setOpen} /></td></tr>`}`;
+            ${isOpen && html`<tr key=${`${id}/`} class="plot-row"><td colspan="9"><div class="opened"><${Run} run=${run} page=${page} changed=${changed}
+              open=${setOpen} /></div></td></tr>`}`;
         })}</tbody></table></div>`}
     ${shown.length > count && html`<button type="button" onClick=${() => setCount(count + PAGE_RUNS)}>Show ${Math.min(PAGE_RUNS, shown.length - count)} more</button>`}
     <${Trash} page=${page} changes=${changes} changed=${changed} />`;

@@ -632,6 +632,8 @@ def test_an_opened_run_a_comparison_and_the_trash_fit_each_screen_and_have_no_ba
         for width in (1280, 800, 390):
             page.set_viewport_size({"width": width, "height": 844})
             assert page.evaluate("document.documentElement.scrollWidth") == width
+            table = page.locator("#runs table.runs")
+            assert table.evaluate("node => node.scrollWidth <= node.parentNode.clientWidth")
             refuse_barriers(page)
         walk(page)
 
