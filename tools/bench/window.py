@@ -41,6 +41,12 @@ OPTIONS: Options = {
     "--rounds": {"type": int, "default": 10, "help": "default 10"},
     "--stops": {"type": int, "default": 20, "help": "emergency stops; default 20"},
 }
+_LOAD = (
+    "/api/runs/large.mcap/download/recording.mcap",
+    "/api/runs/large.mcap/download/all.zip",
+    "/api/results.png?run=small.mcap",
+)
+"""Requests that go on during the emergency stops."""
 _PAINT = """() => performance.getEntriesByName("first-contentful-paint")[0]?.startTime ?? 0"""
 _WEIGHT = """() => [performance.getEntriesByType("navigation")[0],
   ...performance.getEntriesByType("resource")].reduce((sum, each) => sum + each.transferSize, 0)"""
@@ -191,8 +197,10 @@ def _stop(number: int, folder: Path) -> list[float]:
         fish = stack.enter_context(Fish(fishd.endpoint))
         fishd.next_tick()
         _make_runs(fishd, folder / "runs")
-        for path in ("/api/runs/large/zip", "/api/runs/small/plot"):
+        loads = [
             stack.enter_context(Process(sys.executable, "-c", _REPEAT, window.url + path))
+            for path in _LOAD
+        ]
 
         def width() -> float:
             return pi.pigpiod.width(GPIO, time.monotonic())
@@ -208,6 +216,8 @@ def _stop(number: int, folder: Path) -> list[float]:
             while width() and time.monotonic() < begun + TIMEOUT_S:
                 time.sleep(0.005)
             stops.append(pi.pigpiod.history(GPIO)[-1][0] - begun)
+        if not all(load.runs for load in loads):
+            raise SystemExit("fishd-window refused a download or a picture during the stops")
     return stops
 
 
