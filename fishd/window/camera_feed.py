@@ -48,7 +48,7 @@ class Picture(Struct, frozen=True):
     """A JPEG picture for a page."""
 
     header: str
-    """What the page draws into it, as JSON."""
+    """Crop, midline and fin angle, which the page draws into it, as JSON."""
     jpeg: bytes
 
 

@@ -36,7 +36,7 @@ def go(page: Page, place: str) -> None:
     expect(page.locator(f"main[data-place={place}]")).to_be_visible()
     if place == "fish":
         expect(page.locator("#configuration table")).to_be_visible()
-    expect(page.get_by_text("Loading …")).to_have_count(0)
+        expect(page.locator("#about").get_by_text("Loading …")).to_have_count(0)
 
 
 def swim(page: Page, controller: str = "swing") -> None:
