@@ -55,9 +55,9 @@ def rename(run: str, name: str, folder: Path | None, as_json: bool) -> None:
 @click.argument("runs", nargs=-1, required=True)
 @_options
 def delete(runs: tuple[str, ...], folder: Path | None, as_json: bool) -> None:
-    """Move runs into the trash, from which 'fishctl runs restore' brings them back.
+    """Move runs into the trash, where they are kept for 30 days.
 
-    They stay there for 30 days, and take space on the disk until then.
+    'fishctl runs restore' brings them back; until then they take space on the disk.
     """
     place = _find_folder(folder)
     paths = [stored_runs.find_stored_run(run, place) for run in runs]
@@ -88,7 +88,10 @@ def trash(empty: bool, folder: Path | None, as_json: bool) -> None:
 @click.argument("run")
 @_options
 def restore(run: str, folder: Path | None, as_json: bool) -> None:
-    """Bring a run back from the trash: RUN is its name, or its line in 'fishctl runs trash'."""
+    """Bring a run back from the trash.
+
+    RUN is its name, or its line in 'fishctl runs trash'.
+    """
     print_paths([stored_runs.restore_run(run, _find_folder(folder))], as_json)
 
 
@@ -128,9 +131,9 @@ def pack(run: str, target: Path | None, folder: Path | None) -> None:
 @click.argument("runs", nargs=-1, required=True)
 @_options
 def show(runs: tuple[str, ...], folder: Path | None, as_json: bool) -> None:
-    """Show the results of runs side by side, with their 95 % confidence intervals.
+    """Show the results of runs side by side.
 
-    A search shows its answer, not the luckiest of its candidates. 'fishctl plot RUN RUN' draws
+    Intervals are 95 % confidence intervals. A search shows its answer, not the luckiest of its candidates. 'fishctl plot RUN RUN' draws
     recordings over each other.
     """
     from rich.table import Table

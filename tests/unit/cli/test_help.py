@@ -94,9 +94,10 @@ def test_no_option_with_bounds_accepts_nan() -> None:
 
 
 WITHOUT_JSON = {
-    *("calibrate force", "calibrate servo", "completion", "config example"),
+    *("calibrate force", "calibrate servo", "camera page", "completion", "config example"),
     *("virtual-pi clear", "virtual-pi inject", "virtual-pi press", "virtual-pi run"),
     *("config schema", "virtual-pi release-button", "window", "window open", "window start"),
+    "runs zip",
 }
 """Verbs that print no result: dialogues, scripts, or nothing."""
 METAVARS = {
