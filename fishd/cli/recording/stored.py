@@ -133,8 +133,8 @@ def pack(run: str, target: Path | None, folder: Path | None) -> None:
 def show(runs: tuple[str, ...], folder: Path | None, as_json: bool) -> None:
     """Show the results of runs side by side.
 
-    Intervals are 95 % confidence intervals. A search shows its answer, not the luckiest of its candidates. 'fishctl plot RUN RUN' draws
-    recordings over each other.
+    Intervals are 95 % confidence intervals. A search shows its answer, not the luckiest of its
+    candidates. 'fishctl plot RUN RUN' draws recordings over each other.
     """
     from rich.table import Table
 
