@@ -25,14 +25,15 @@ _ENLARGED_SIZE_PX = 640
 
 def to_colours(pixels: Pixels) -> Colours:
     """Return grey levels as colours."""
-    return np.repeat(pixels[:, :, np.newaxis], 3, axis=2)
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB), np.uint8)
 
 
 def draw_motion(energy: Floats) -> Colours:
     """Return a picture of motion, from black where nothing moves to yellow where most moves."""
     strength = np.sqrt(energy / max(float(np.quantile(energy, 0.995)), 1e-12))
     levels = np.asarray(np.clip(255.0 * strength, 0.0, 255.0), np.uint8)
-    return _swap_red_and_blue(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO))
+    coloured = cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO)
+    return np.asarray(cv2.cvtColor(coloured, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def enlarge(colours: Colours) -> Colours:
@@ -77,13 +78,8 @@ def decode_view(view: PublishedView) -> Colours:
 
 def write_png(path: Path, colours: Colours) -> None:
     """Write a picture; raises `FishdError`."""
-    _, data = cv2.imencode(".png", _swap_red_and_blue(colours))
+    _, data = cv2.imencode(".png", cv2.cvtColor(colours, cv2.COLOR_RGB2BGR))
     try:
         write_atomically(path, data.tobytes())
     except OSError as error:
         raise FishdError(f"{path} cannot be written: {error.strerror or error}") from None
-
-
-def _swap_red_and_blue(colours: object) -> Colours:
-    """Return a picture with red and blue exchanged, because OpenCV stores blue first."""
-    return np.ascontiguousarray(np.asarray(colours, np.uint8)[:, :, ::-1])

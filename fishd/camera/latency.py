@@ -22,7 +22,7 @@ MIN_SWIM_S = 10.0
 """Shortest swim from which the delay is estimated [s]."""
 JACKKNIFE_PARTS = 12
 """Number of parts of the swim; the jackknife leaves out one of them at a time."""
-_STUDENT = 2.201
+STUDENT = 2.201
 """97.5 % quantile of Student's t with `JACKKNIFE_PARTS` - 1 degrees of freedom."""
 _MIN_FREQUENCY_HZ = 0.35
 """Lowest frequency of swimming; slower changes are drift of the sensor [Hz]."""
@@ -106,9 +106,9 @@ def find_latency(frames: Sequence[Frame], forces: Sequence[Force]) -> Latency:
         )
     left_out = [
         Fit(angle, times[kept], position[kept]).near(delay, log_rate)[0]
-        for kept in _all_but_one_part(len(times))
+        for kept in leave_out_parts(len(times))
     ]
-    ci95 = _STUDENT * math.sqrt((JACKKNIFE_PARTS - 1) * float(np.var(left_out)))
+    ci95 = STUDENT * math.sqrt((JACKKNIFE_PARTS - 1) * float(np.var(left_out)))
     late = [frame.available - frame.time for frame in inside]
     return Latency(
         stamps=delay,
@@ -120,7 +120,8 @@ def find_latency(frames: Sequence[Frame], forces: Sequence[Force]) -> Latency:
     )
 
 
-def _all_but_one_part(number: int) -> list[NDArray[np.bool_]]:
+def leave_out_parts(number: int) -> list[NDArray[np.bool_]]:
+    """Return for each part of a jackknife which of a number of values are kept."""
     part = np.arange(number) * JACKKNIFE_PARTS // number
     return [part != left_out for left_out in range(JACKKNIFE_PARTS)]
 

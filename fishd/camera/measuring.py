@@ -60,7 +60,7 @@ class Measuring:
         publish: called in the thread with each result
         """
         self._settings = settings.tail
-        self._read_out = turn_read_out(settings.tail.read_out, settings.picture)
+        self._read_out = turn_read_out(settings.tail.read_out, settings.picture.rotate)
         self._path, self._lens_path = path, path.with_suffix(".lens.json")
         self._rotate = settings.picture.rotate
         self._publish = publish

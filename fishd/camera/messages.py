@@ -228,41 +228,20 @@ class PublishedView(NamedTuple):
 
 Message = PublishedFrame | PublishedView | TailMessage | CameraState | Until
 
-_encode = msgspec.json.Encoder().encode
-
-
-def encode_frame(header: FrameHeader, pixels: Pixels) -> list[bytes]:
-    """Return the parts of a message with a frame."""
-    return [FRAME, _encode(header), pixels.tobytes()]
-
-
-def encode_view(header: ViewHeader, jpeg: bytes) -> list[bytes]:
-    """Return the parts of a message with a view."""
-    return [VIEW, _encode(header), jpeg]
-
-
-def encode_state(state: CameraState) -> list[bytes]:
-    """Return the parts of a message with the state."""
-    return [STATE, _encode(state)]
-
-
-def encode_tail(tail: TailMessage) -> list[bytes]:
-    """Return the parts of a message with a fin angle."""
-    return [TAIL, _encode(tail)]
-
-
-def encode_until(until: Until) -> list[bytes]:
-    """Return the parts of a message `until`."""
-    return [UNTIL, _encode(until)]
-
-
-_decoders: dict[bytes, Any] = {
-    FRAME: decoder(FrameHeader),
-    VIEW: decoder(ViewHeader),
-    TAIL: decoder(TailMessage),
-    STATE: decoder(CameraState),
-    UNTIL: decoder(Until),
+Header = FrameHeader | ViewHeader | TailMessage | CameraState | Until
+TOPICS: dict[type[Header], bytes] = {
+    FrameHeader: FRAME,
+    ViewHeader: VIEW,
+    TailMessage: TAIL,
+    CameraState: STATE,
+    Until: UNTIL,
 }
+_decoders: dict[bytes, Any] = {topic: decoder(kind) for kind, topic in TOPICS.items()}
+
+
+def encode(header: Header, *picture: bytes) -> list[bytes]:
+    """Return the parts of a message; picture: that of a frame or a view."""
+    return [TOPICS[type(header)], msgspec.json.encode(header), *picture]
 
 
 class _OnlyVersion(Struct):
@@ -287,9 +266,7 @@ def decode(parts: Sequence[bytes]) -> Message:
                 f"a message of topic {name} in version {version}; version {VERSION} is needed: "
                 "install the same version of fishd for camera and client"
             )
-        header: FrameHeader | ViewHeader | TailMessage | CameraState | Until = _decoders[topic](
-            parts[1]
-        )
+        header: Header = _decoders[topic](parts[1])
     except msgspec.DecodeError as error:
         raise BadMessage(f"a message of topic {name} that cannot be read: {error}") from None
     if isinstance(header, FrameHeader):

@@ -1,43 +1,34 @@
 """Conversion of a camera's picture to the frame for learners and the view for people."""
 
-from contextlib import suppress
-from pathlib import Path
-
 import cv2
 import numpy as np
 import simplejpeg
 
 from fishd.camera.messages import Crop
 from fishd.camera.settings import PictureSettings, PublishSettings
-from fishd.core import files
 from fishd.core.camera_frames import Pixels
 
-_MAX_BYTES = 2**26
 _TURNS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
 
-def read_picture(path: Path) -> Pixels | None:
-    """Return the grey levels of the picture in a file; None if it is no such file."""
-    with suppress(files.FileProblem, cv2.error):
-        content = np.frombuffer(files.read(path, _MAX_BYTES, "a picture"), np.uint8)
-        picture = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE)
-        return None if picture is None else np.asarray(picture, np.uint8)
-    return None
+def to_grey(picture: object) -> Pixels:
+    """Return the grey levels of a picture of OpenCV."""
+    pixels = np.asarray(picture, np.uint8)
+    return pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)  # type: ignore[return-value]
 
 
-def rotate(picture: Pixels, settings: PictureSettings) -> Pixels:
-    """Return the picture turned so that the fish's head is at the left."""
-    turn = _TURNS.get(settings.rotate)
-    return picture if turn is None else np.asarray(cv2.rotate(picture, turn), np.uint8)
+def rotate(picture: Pixels, turn: int) -> Pixels:
+    """Return the picture turned clockwise by 0, 90, 180 or 270 [degrees]."""
+    return np.asarray(cv2.rotate(picture, _TURNS[turn]), np.uint8) if turn else picture
 
 
-def turn_read_out(read_out: float, settings: PictureSettings) -> tuple[float, float]:
+def turn_read_out(read_out: float, turn: int) -> tuple[float, float]:
     """Return the time from the exposure of the first row of a turned picture to that of the last.
 
     The second value is the same for the columns, of a picture that was turned by 90° [s].
     read_out: of the picture before it was turned [s]
+    turn: clockwise turn [degrees]
     """
-    turn = settings.rotate
     return (
         {0: read_out, 180: -read_out}.get(turn, 0.0),
         {90: -read_out, 270: read_out}.get(turn, 0.0),

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -78,11 +79,11 @@ class Server:
             self._requests.operations = {
                 "status": self._state,
                 "config": lambda: without_password(self._settings),
-                "learn_tail": self._begin_learning,
-                "finish_tail": self._finish_learning,
-                "cancel_tail": self._cancel_learning,
+                "learn_tail": partial(self._do, self._measuring.begin_learning),
+                "finish_tail": partial(self._do, self._measuring.finish_learning),
+                "cancel_tail": partial(self._do, self._measuring.cancel_learning),
                 "lens": self._lens,
-                "set_lens": self._set_lens,
+                "set_lens": partial(self._do, self._measuring.set_lens),
             }
             self._requests.arguments = {"set_lens": Lens}
             stack.enter_context(self._measuring)
@@ -180,7 +181,7 @@ class Server:
         if len(self._queue) > _MAX_QUEUED_JOBS:
             self.lost(dropped=1)
             return
-        turned = picture.rotate(shot.picture, self._settings.picture)
+        turned = picture.rotate(shot.picture, self._settings.picture.rotate)
         pixels = picture.make_frame(turned, self._settings.picture)
         shot = shot._replace(picture=turned)
         self._enqueue(lambda: self._publish(shot, pixels))
@@ -218,7 +219,7 @@ class Server:
 
     def _publish_tail(self, tail: TailMessage) -> None:
         """Queue a fin angle; called in the thread that measures."""
-        self._queue.append(lambda: self._publisher.send(messages.encode_tail(tail)))
+        self._queue.append(lambda: self._publisher.send(messages.encode(tail)))
         self._wake()
 
     # The rest runs in the thread of the sockets.
@@ -244,7 +245,7 @@ class Server:
             width=pixels.shape[1],
             height=pixels.shape[0],
         )
-        self._publisher.send(messages.encode_frame(header, pixels))
+        self._publisher.send(messages.encode(header, pixels.tobytes()))
         self._measuring.offer(monitor.session, monitor.seq, shot.time, shot.picture)
         self._publish_view(shot)
         if changed:
@@ -266,12 +267,12 @@ class Server:
             height=height,
             crop=crop,
         )
-        self._publisher.send(messages.encode_view(header, jpeg))
+        self._publisher.send(messages.encode(header, jpeg))
 
     def _publish_until(self, until: float) -> None:
         self._monitor.until = until
         message = Until(session=self._monitor.session, until=until)
-        self._publisher.send(messages.encode_until(message))
+        self._publisher.send(messages.encode(message))
 
     def _publish_state(self, changed: bool, *, only_changes: bool = False) -> None:
         """Publish the state.
@@ -287,30 +288,19 @@ class Server:
             log.log(level, "%s", line)
             self._notifier.status(line)
         self._next_state = time.monotonic() + STATE_PERIOD
-        self._publisher.send(messages.encode_state(self._state()))
-
-    def _begin_learning(self) -> CameraState:
-        self._measuring.begin_learning()
-        return self._state()
+        self._publisher.send(messages.encode(self._state()))
 
     def _lens(self) -> Lens:
         if self._measuring.lens is None:
             raise Refused("no-lens", "its lens is not calibrated: run 'fishctl camera lens'")
         return self._measuring.lens
 
-    def _set_lens(self, lens: Lens) -> CameraState:
+    def _do(self, work: Callable[..., None], *values: object) -> CameraState:
+        """Do the work of a request, and return the state."""
         try:
-            self._measuring.set_lens(lens)
+            work(*values)
         except CannotUseLens as error:
             raise Refused("bad-lens", text.error_message(error)) from None
-        return self._state()
-
-    def _finish_learning(self) -> CameraState:
-        self._measuring.finish_learning()
-        return self._state()
-
-    def _cancel_learning(self) -> CameraState:
-        self._measuring.cancel_learning()
         return self._state()
 
     def _state(self) -> CameraState:

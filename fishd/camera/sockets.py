@@ -31,25 +31,38 @@ _IN_USE = "it is in use, perhaps by another fishd-camera; end that, or choose an
 _ADVICE = "end it, or give this one another publish.frames and publish.requests"
 
 
-class Publisher:
-    """Non-blocking XPUB socket for frames, which reports the topics of its subscribers."""
+class _Listener:
+    """ZeroMQ socket that listens, and whose file can be created again."""
+
+    kind: int
+    key: str
+    """Key of its address in the settings."""
 
     def __init__(self, address: str, stack: ExitStack) -> None:
         """Listen at an address; raises `StartupError`."""
-        listener, self.address = _listen(address, "publish.frames", stack)
-        self.file = SocketFile(self, self.address, "publish.frames", group=False)
-        self._topics: set[bytes] = set()
-        """Subscriptions that match views: `view`, or a prefix of it."""
+        listener, self.address = _listen(address, self.key, stack)
+        self.file = SocketFile(self, self.address, self.key, group=False)
         self._stack = ExitStack()
         stack.callback(lambda: self._stack.close())
         self.listen_at(self.address, listener)
 
     def listen_at(self, address: str, listener: sockets.socket) -> None:
-        """Listen at a new file from now on; all subscribers connect again."""
+        """Listen at a new file from now on; all clients connect again."""
         self._stack.close()
         self._stack = ExitStack()
-        self._topics.clear()
-        self.socket = _bind(zmq.XPUB, address, listener, self._stack)
+        self.socket = _bind(self.kind, address, listener, self._stack)
+
+
+class Publisher(_Listener):
+    """Non-blocking XPUB socket for frames, which reports the topics of its subscribers."""
+
+    kind, key = zmq.XPUB, "publish.frames"
+
+    def listen_at(self, address: str, listener: sockets.socket) -> None:
+        """Listen at a new file from now on; all subscribers connect again."""
+        self._topics: set[bytes] = set()
+        """Subscriptions that match views: `view`, or a prefix of it."""
+        super().listen_at(address, listener)
 
     def send(self, parts: list[bytes]) -> None:
         """Publish a message."""
@@ -74,26 +87,18 @@ class Publisher:
         return state
 
 
-class Requests:
+class Requests(_Listener):
     """Socket for requests, each answered at once."""
+
+    kind, key = zmq.ROUTER, "publish.requests"
 
     def __init__(self, address: str, stack: ExitStack) -> None:
         """Listen at an address; raises `StartupError`."""
-        listener, self.address = _listen(address, "publish.requests", stack)
-        self.file = SocketFile(self, self.address, "publish.requests", group=False)
-        self._stack = ExitStack()
-        stack.callback(lambda: self._stack.close())
-        self.listen_at(self.address, listener)
+        super().__init__(address, stack)
         self.operations: dict[str, Callable[..., Any]] = {}
         """Functions that compute the results of requests, by name of the operation."""
         self.arguments: dict[str, type[Struct]] = {}
         """Kinds of the arguments of those that take any."""
-
-    def listen_at(self, address: str, listener: sockets.socket) -> None:
-        """Listen at a new file from now on; all clients connect again."""
-        self._stack.close()
-        self._stack = ExitStack()
-        self.socket = _bind(zmq.ROUTER, address, listener, self._stack)
 
     def answer(self) -> None:
         """Answer the waiting requests; an invalid message gets an error, or no answer."""

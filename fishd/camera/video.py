@@ -12,10 +12,8 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file")
 
 import cv2
-import numpy as np
 
-from fishd.camera.picture import rotate, turn_read_out
-from fishd.camera.settings import PictureSettings
+from fishd.camera.picture import rotate, to_grey, turn_read_out
 from fishd.camera.tail.learned import Learned
 from fishd.camera.tail.learner import CannotLearn, Learner
 from fishd.camera.tail.lens import Lens, Turn
@@ -60,7 +58,7 @@ class Video:
         Raises `CannotReadVideo`.
         """
         self.path, self.shown = path, text.quoted(str(path))
-        self._turn = PictureSettings(rotate=turn)
+        self._turn = turn
         head = self._read_head()
         self._capture = self._open()
         width, height, stated, count = (
@@ -135,9 +133,6 @@ class Video:
             success, picture = self._capture.retrieve()
             if not success:
                 break
-            pixels = np.asarray(picture, np.uint8)
-            if pixels.ndim == 3:
-                pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), np.uint8)
             time = (number - 1) / self.rate
             if self._has_times:
                 time = 1e-3 * self._capture.get(cv2.CAP_PROP_POS_MSEC)
@@ -147,7 +142,7 @@ class Video:
                         "before: give the rate of its pictures, such as --rate 30"
                     )
                 latest = time
-            yield VideoPicture(number - 1, time, rotate(pixels, self._turn))
+            yield VideoPicture(number - 1, time, rotate(to_grey(picture), self._turn))
         if not number:
             raise CannotReadVideo(f"{self.shown} contains no picture that can be read")
 

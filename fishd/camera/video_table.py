@@ -9,7 +9,7 @@ from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Generic, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import msgspec
 import numpy as np
@@ -28,23 +28,8 @@ class CannotWriteTable(FishdError, ValueError):
     """A table cannot be written or completed."""
 
 
-class Source(Struct, frozen=True, kw_only=True):
-    """Video and options on which the rows of a table depend."""
-
-    video: str
-    size: int
-    modified: int
-    rate: float | None
-    turn: int
-    read_out: float
-    length_mm: float | None
-    is_free: bool
-    tag: int | None
-    has_midline: bool
-
-
 class _Head(Struct, frozen=True):
-    source: Source
+    source: dict[str, Any]
     learned: msgspec.Raw
 
 
@@ -54,9 +39,10 @@ class VideoTable(Generic[Learned]):
     The unfinished file begins with a line that says what its rows are from.
     """
 
-    def __init__(self, path: Path, source: Source, kind: type[Learned]) -> None:
+    def __init__(self, path: Path, source: dict[str, Any], kind: type[Learned]) -> None:
         """Raise `CannotWriteTable` where the file of this path cannot be written.
 
+        source: video, the first key, and options on which the rows depend
         kind: of what is learned from the video before the rows are measured
         """
         self.path, self.source = path, source

@@ -17,7 +17,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from fishd.camera.tail.beats import Beat, average, find_maxima
-from fishd.camera.tail.ground import shrink
+from fishd.camera.tail.ground import shrink, to_levels
 from fishd.camera.video import Video, VideoPicture
 from fishd.core.camera_frames import Pixels
 from fishd.core.errors import FishdError
@@ -155,7 +155,7 @@ def learn_ground(video: Video) -> FreeGround:
         if place < _GROUND_PICTURES:
             kept[place : place + 1] = [shrink(picture.pixels, _WIDTH_PX)]
     height, width = kept[0].shape
-    levels = _to_levels(_find_ground(np.stack(kept)))
+    levels = to_levels(_find_ground(np.stack(kept)))
     finder = FreeFish(FreeGround(levels.tobytes(), (width, height)), video)
     changes = [finder.compare(small)[0] for small in kept]
     # The fish may be away in most pictures.
@@ -317,12 +317,8 @@ def _find_ground(pictures: NDArray[np.uint8]) -> Floats:
     beyond = [0, *labels[[0, -1]].ravel(), *labels[:, [0, -1]].ravel()]  # the wall of a tank
     body = np.isin(labels, np.setdiff1d(near, beyond)).astype(np.uint8)
     body = np.asarray(cv2.dilate(body, np.ones((9, 9))), np.uint8)
-    filled = cv2.inpaint(_to_levels(ground), body, 3.0, cv2.INPAINT_TELEA)
+    filled = cv2.inpaint(to_levels(ground), body, 3.0, cv2.INPAINT_TELEA)
     return np.where(body > 0, filled, ground)
-
-
-def _to_levels(ground: Floats) -> Pixels:
-    return np.clip(np.rint(ground), 0, 255).astype(np.uint8)
 
 
 def describe_swim(

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.camera.latency import Fit, Force, ForceAngle
+from fishd.camera.latency import JACKKNIFE_PARTS, STUDENT, Fit, Force, ForceAngle, leave_out_parts
 from fishd.core.errors import FishdError
 
 MIN_OVERLAP_S = 5.0
@@ -30,9 +30,6 @@ _MIN_DISTANCE_S = 0.1
 """Smallest distance of an offset that differs from the best one [s]."""
 _RIVAL_MISFIT = 1.5
 """Misfit below which another offset fits as well, relative to that of the best one."""
-_PARTS = 12
-_STUDENT = 2.201
-"""97.5 % quantile of Student's t with `_PARTS` - 1 degrees of freedom."""
 
 Array = NDArray[np.float64]
 
@@ -121,15 +118,13 @@ class _Fit(NamedTuple):
 
     def with_intervals(self) -> ClockOffset:
         """Return the offset with its interval from a jackknife over parts of the pictures."""
-        part = np.arange(len(self.times)) * _PARTS // len(self.times)
         middle = 0.5 * float(self.times[0] + self.times[-1])
         points = []
-        for left_out in range(_PARTS):
-            kept = part != left_out
+        for kept in leave_out_parts(len(self.times)):
             point = Fit(self.angle, self.times[kept], self.angles[kept]).near(*self.point)
             centre = 0.5 * float(self.times[kept][0] + self.times[kept][-1])
             points.append((-point[0] + point[2] * (middle - centre), point[2]))
-        errors = _STUDENT * math.sqrt(_PARTS - 1) * np.std(points, axis=0)
+        errors = STUDENT * math.sqrt(JACKKNIFE_PARTS - 1) * np.std(points, axis=0)
         return ClockOffset(
             offset=self.offset,
             ci95=float(errors[0]),
@@ -212,7 +207,10 @@ def _refine(
         return None
     angle = ForceAngle(near)
     inside = (times + offset > angle.first + 0.2) & (times + offset < angle.last - 0.2)
-    if np.count_nonzero(inside) < 4 * _PARTS or np.ptp(times[inside]) < MIN_OVERLAP_S - 0.5:
+    if (
+        np.count_nonzero(inside) < 4 * JACKKNIFE_PARTS
+        or np.ptp(times[inside]) < MIN_OVERLAP_S - 0.5
+    ):
         return None
     kept = times[inside], angles[inside]
     fit = Fit(angle, *kept)

@@ -109,12 +109,12 @@ class Outcome(NamedTuple):
     """Time from the fault to the first reading that says that something has moved [s]."""
 
 
-def fail(learned: Learned, film: Film, fault: str, seed: int) -> Outcome:
-    """Return the outcome of a fault in a film, whose details are random."""
+def fail(learned: Learned, film: Film, fault: str, seed: int, until: float = END_S) -> Outcome:
+    """Return the outcome of a fault in a film, whose details are random, until a time [s]."""
     random = np.random.default_rng([seed, list(FAULTS).index(fault)])
     faulty = FAULTS[fault](film, random)
     meter, readings = TailMeter(learned), list[TailReading]()
-    for part, begin, end in ((film, LEARNED_S, BEGIN_S), (faulty, BEGIN_S, END_S)):
+    for part, begin, end in ((film, LEARNED_S, BEGIN_S), (faulty, BEGIN_S, until)):
         readings = [
             meter.read(shot.time, shot.picture, part.read_out)
             for shot in FilmedTail(part).shots(begin, end)

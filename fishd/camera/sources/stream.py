@@ -10,11 +10,10 @@ from pathlib import Path
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 import cv2
-import numpy as np
 
+from fishd.camera.picture import to_grey
 from fishd.camera.settings import StreamSettings, hide_secrets
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
-from fishd.core.camera_frames import Pixels
 from fishd.core.clock import read_boot_id
 
 PAUSES = 1.0, 10.0
@@ -89,8 +88,7 @@ class StreamSource:
                     if stopping(max(0.0, due - time.monotonic())):
                         return
                 now = time.monotonic()
-                grey = _to_grey(np.asarray(picture, np.uint8))
-                sink.put(Shot(now - self._settings.delay, time.monotonic(), grey))
+                sink.put(Shot(now - self._settings.delay, time.monotonic(), to_grey(picture)))
 
     def _handle_end(self, frame_count: int) -> None:
         """Handle the end of the frames: raise `Trouble` unless a file is to be repeated."""
@@ -137,9 +135,3 @@ def _open(url: str) -> Iterator[cv2.VideoCapture]:
         yield capture
     finally:
         capture.release()
-
-
-def _to_grey(picture: Pixels) -> Pixels:
-    if picture.ndim == 2:
-        return picture
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)

@@ -30,6 +30,11 @@ def shrink(picture: Pixels, largest_width: int = SMALL_WIDTH_PX) -> Pixels:
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
+def to_levels(picture: Floats) -> Pixels:
+    """Return the nearest grey levels."""
+    return np.asarray(np.clip(picture + 0.5, 0.0, 255.0), np.float32).astype(np.uint8)
+
+
 class Ground:
     """Picture without the tail; `cover` is 1 where the tail is and 0 where the ground is."""
 

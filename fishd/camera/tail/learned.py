@@ -26,6 +26,11 @@ ORDER = 4
 PerStation = Annotated[tuple[float, ...], Meta(min_length=STATIONS, max_length=STATIONS)]
 
 
+def find_stations(fin: tuple[float, float]) -> slice:
+    """Return the stations between two fractions of the tail's length from its tip."""
+    return slice(round((1.0 - fin[1]) * STATIONS), round((1.0 - fin[0]) * STATIONS))
+
+
 class CannotUse(FishdError, ValueError):
     """A file of a learned tail cannot be read, or does not fit the pictures."""
 
@@ -96,12 +101,6 @@ class Learned(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     lens: Annotated[
         Lens | None, note("Calibration with which it was learned; null without one.")
     ] = None
-
-    @property
-    def is_light(self) -> bool:
-        """Whether the tail is lighter than the ground."""
-        empty = self.background_picture()[self.swept_mask()]
-        return self.tail_level > float(np.median(empty))
 
     def background_picture(self) -> Pixels:
         """Return the picture without the tail, shape (height, width) of `background_size`."""

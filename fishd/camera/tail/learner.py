@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fishd.camera.axis import NoMotion, find_motion
-from fishd.camera.tail.ground import Floats, Ground, Mask, shrink
-from fishd.camera.tail.learned import ORDER, Learned
+from fishd.camera.tail.ground import Floats, Ground, Mask, shrink, to_levels
+from fishd.camera.tail.learned import ORDER, Learned, find_stations
 from fishd.camera.tail.lens import Lens
 from fishd.camera.tail.profile import STATIONS, Array, Pose, Trace, Tracer, fit_line
 from fishd.camera.tail.scene import Scene
@@ -112,15 +112,6 @@ class Learner:
         pictures = [picture for _, picture in self._pictures]
         scene = _Scene(pictures, self._size[0] / pictures[0].shape[1])
         traces = _trace_all(scene, pictures, self._lens)
-        return self._summarise(scene, times, traces, pictures)
-
-    def _summarise(
-        self,
-        scene: "_Scene",
-        times: Array,
-        traces: list[Trace | None],
-        pictures: list[Pixels],
-    ) -> Learned:
         seen = [trace for trace in traces if trace is not None]
         if len(seen) < 0.6 * len(traces):
             raise CannotLearn(
@@ -135,10 +126,9 @@ class Learner:
             raise CannotLearn(_NO_SHAPE)
         scene.check_edges(np.stack([trace.places for trace in seen]))
         fin = _find_fin(points, weight)
-        first, last = _stations(fin)
+        part = find_stations(fin)
         lines = [
-            fit_line(trace.points[first:last], np.maximum(trace.weight[first:last], 0.01))
-            for trace in seen
+            fit_line(trace.points[part], np.maximum(trace.weight[part], 0.01)) for trace in seen
         ]
         angle = np.array([line.angle for line in lines])
         zero, zero_ci95 = _find_zero(times, angle)
@@ -319,7 +309,7 @@ def _even_light(pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
     factors = (mean.mean() / mean).astype(np.float32)
     bright = np.empty_like(pictures)
     for picture, factor, whole in zip(pictures, factors, bright, strict=True):
-        whole[:] = _to_levels(picture * factor)
+        whole[:] = to_levels(picture * factor)
     spread = bright.max(axis=0).astype(np.float32) - bright.min(axis=0)
     still = spread < np.median(spread) + 0.3 * (spread.max() - np.median(spread))
     typical = np.median(bright[::2], axis=0)
@@ -329,12 +319,8 @@ def _even_light(pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
     for picture, factor, even in zip(pictures, factors, bright, strict=True):
         light = (picture * still).sum(axis=1) * factor / total
         light = np.interp(rows, rows[known], light[known]).astype(np.float32)
-        even[:] = _to_levels(picture * (factor / light)[:, None])
+        even[:] = to_levels(picture * (factor / light)[:, None])
     return bright
-
-
-def _to_levels(picture: Floats) -> Pixels:
-    return np.asarray(np.clip(picture + 0.5, 0.0, 255.0), np.float32).astype(np.uint8)
 
 
 def _trace_all(scene: _Scene, pictures: list[Pixels], lens: Lens | None) -> list[Trace | None]:
@@ -360,11 +346,6 @@ def _find_pose_error(scene: _Scene, pictures: list[Pixels]) -> tuple[float, floa
     poses = [still.find_pose(picture, ground.light(picture))[0] for picture in small]
     along, down, turn = np.quantile(np.abs(poses), 0.95, axis=0).tolist()
     return ground.scale * scene.factor * along, ground.scale * scene.factor * down, turn
-
-
-def _stations(fin: tuple[float, float]) -> tuple[int, int]:
-    """Return the first station of the fin and the one after its last."""
-    return round((1.0 - fin[1]) * STATIONS), round((1.0 - fin[0]) * STATIONS)
 
 
 def _find_fin(points: Array, weight: Array) -> tuple[float, float]:

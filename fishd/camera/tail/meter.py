@@ -12,12 +12,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from fishd.camera.tail.ground import Floats, Ground, shrink
-from fishd.camera.tail.learned import CannotUse, Learned
+from fishd.camera.tail.ground import Floats, Ground, Mask, shrink
+from fishd.camera.tail.learned import CannotUse, Learned, find_stations
 from fishd.camera.tail.learner import cut_off_side
 from fishd.camera.tail.profile import (
     SATURATED,
-    STATIONS,
     Array,
     Line,
     Pose,
@@ -114,13 +113,12 @@ class TailMeter:
         )  # fmt: skip
         self._shape = Shape(np.array(learned.shape), np.array(learned.covariance))
         self._scene = Scene(self._ground)
-        first, last = learned.fin
-        self._fin = slice(round((1.0 - last) * STATIONS), round((1.0 - first) * STATIONS))
-        self._fin_length = learned.length * (last - first)
+        self._fin = find_stations(learned.fin)
+        self._fin_length = learned.length * (learned.fin[1] - learned.fin[0])
         low, high = learned.span
         self._span = _SPAN * low - 0.05, _SPAN * high + 0.05
-        swept = learned.background_picture()[learned.swept_mask()]
-        self._hides_lamps = learned.is_light or float(np.median(swept)) >= SATURATED
+        empty = float(np.median(learned.background_picture()[learned.swept_mask()]))
+        self._hides_lamps = learned.tail_level > empty or empty >= SATURATED
         width = learned.size[0]
         self._max_error = max(_MAX_SHAPE_ERROR * width, _USUAL * learned.shape_error)
         self._max_difference = min(
@@ -358,18 +356,20 @@ class TailMeter:
 
     def _find_foreign(self, small: Pixels, cover: Floats, places: Array) -> tuple[int, int] | None:
         """Return the column and row of something else that covers the ground."""
-        outline = self._outline(places) / self._ground.scale
-        mask = (np.abs(cover) > _FOREIGN_LEVEL) & (small < SATURATED)
-        foreign = mask.astype(np.uint8)
-        cv2.fillPoly(foreign, [np.rint(16 * outline).astype(np.int32)], 0, shift=4)
-        if np.count_nonzero(foreign) < _MAX_FOREIGN * foreign.size:
-            return None
-        rows, columns = np.nonzero(foreign)
-        scale = self._ground.scale
-        return round(float(np.median(columns)) * scale), round(float(np.median(rows)) * scale)
+        foreign = (np.abs(cover) > _FOREIGN_LEVEL) & (small < SATURATED)
+        foreign &= ~self._enclose(places, small.shape)
+        return self._locate(foreign, _MAX_FOREIGN * foreign.size)
 
-    def _outline(self, places: Array) -> Array:
-        """Return the corners of a polygon that encloses the tail, with room for blur."""
+    def _locate(self, mask: Mask, least: float) -> tuple[int, int] | None:
+        """Return the median column and row of pixels; None for fewer than `least`."""
+        rows, columns = np.nonzero(mask)
+        if len(rows) < least:
+            return None
+        x, y = (round(float(np.median(part)) * self._ground.scale) for part in (columns, rows))
+        return x, y
+
+    def _enclose(self, places: Array, shape: tuple[int, ...]) -> Mask:
+        """Return which pixels of the small picture the tail may cover, with room for blur."""
         tangent = np.gradient(places, axis=0)
         tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
         reach = (1.3 * self._half + 0.025 * self.learned.size[0])[:, None]
@@ -380,21 +380,17 @@ class TailMeter:
         )
         middle = np.concatenate([start, places, end])
         normal = np.concatenate([normal[:1], normal, normal[-1:]])
-        return np.concatenate([middle + normal, (middle - normal)[::-1]])
+        outline = np.concatenate([middle + normal, (middle - normal)[::-1]]) / self._ground.scale
+        inside = np.zeros(shape, np.uint8)
+        cv2.fillPoly(inside, [np.rint(16 * outline).astype(np.int32)], 1, shift=4)
+        return inside > 0
 
     def _find_lamp(self, small: Pixels, places: Array) -> str:
         """Return where a lamp is mirrored on the tail; empty if none is."""
         if self._hides_lamps:
             return ""
-        lamp = (small >= SATURATED).astype(np.uint8)
-        inside = np.zeros_like(lamp)
-        outline = self._outline(places) / self._ground.scale
-        cv2.fillPoly(inside, [np.rint(16 * outline).astype(np.int32)], 1, shift=4)
-        rows, columns = np.nonzero(lamp & inside)
-        if len(rows) < 4:
-            return ""
-        x, y = (round(float(np.median(part)) * self._ground.scale) for part in (columns, rows))
-        return f"a lamp is mirrored on the tail at column {x}, row {y}"
+        lamp = self._locate((small >= SATURATED) & self._enclose(places, small.shape), 4)
+        return f"a lamp is mirrored on the tail at column {lamp[0]}, row {lamp[1]}" if lamp else ""
 
 
 def _leaves(side: str) -> str:

@@ -4,6 +4,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -37,7 +38,7 @@ class Shape:
         stations = coefficients.shape[2]
         self.covariance = np.eye(stations) if covariance is None else covariance
         self._information = np.linalg.inv(self.covariance)
-        self._derivative = coefficients[1:] * np.arange(1, len(coefficients))[:, None, None]
+        self._derivative = polyder(coefficients)
 
     @classmethod
     def learn(cls, alpha: Array, points: Array, weight: Array, order: int) -> "Shape":
@@ -59,14 +60,11 @@ class Shape:
 
     def midline(self, alpha: float) -> Array:
         """Return places along and across the axis, shape (stations, 2) [px]."""
-        return np.asarray(
-            np.tensordot(alpha ** np.arange(len(self.coefficients)), self.coefficients, 1).T
-        )
+        return np.asarray(polyval(alpha, self.coefficients).T)
 
     def change(self, alpha: float) -> Array:
         """Return the derivative of `midline` with α, shape (stations, 2) [px/rad]."""
-        powers = alpha ** np.arange(len(self._derivative))
-        return np.asarray(np.tensordot(powers, self._derivative, 1).T)
+        return np.asarray(polyval(alpha, self._derivative).T)
 
     def fit(self, points: Array, weight: Array, alpha: float, span: tuple[float, float]) -> Fit:
         """Return the agreement with a midline.

@@ -1,8 +1,7 @@
 """Measurement of the fin angle in a video file, for `fishctl camera measure VIDEO`."""
 
 import math
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -10,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import click
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from fishd.cli.options import F, FiniteRange, plot_option
 from fishd.cli.output import echo, echo_rows, format_count, print_json
@@ -39,19 +37,7 @@ _MAX_REASONS = 4
 _COLUMNS = ("video_time", "fin_angle", "fin_angle_uncertainty", "tip_column", "tip_row", "reason")
 _MM_COLUMNS = ("tip_along_mm", "tip_across_mm")
 
-Array = NDArray[np.float64]
 Knowledge = TypeVar("Knowledge", bound=Struct)
-
-
-class _Measured(NamedTuple):
-    """All fin angles of a video."""
-
-    times: Array
-    """Times of the pictures [s]."""
-    angles: Array
-    """Fin angles, NaN where unknown [rad]."""
-    reasons: Counter[str]
-    """Number of pictures by the reason why the angle is unknown."""
 
 
 class VideoOptions(NamedTuple):
@@ -170,7 +156,7 @@ def open_table(
     kind: of what is learned from the video before it is measured
     """
     from fishd.camera.video import Video
-    from fishd.camera.video_table import Source, VideoTable
+    from fishd.camera.video_table import VideoTable
     from fishd.lab import drawing
 
     if options.target is None:
@@ -180,18 +166,10 @@ def open_table(
     turn, read_out = options.turn or 0, 1e-3 * (options.read_out_ms or 0.0)
     with Video(path, options.rate, turn, read_out) as video:
         status = path.stat()
-        source = Source(
-            video=str(path.resolve()),
-            size=status.st_size,
-            modified=status.st_mtime_ns,
-            rate=options.rate,
-            turn=turn,
-            read_out=read_out,
-            length_mm=options.length_mm,
-            is_free=bool(options.free),
-            tag=options.tag,
-            has_midline=bool(options.has_midline),
-        )
+        source = {"video": str(path.resolve()), "size": status.st_size}
+        source |= {"modified": status.st_mtime_ns, "turn": turn}
+        for name in ("rate", "read_out_ms", "length_mm", "free", "tag", "has_midline"):
+            source[name] = getattr(options, name)
         with VideoTable(options.target, source, kind) as table:
             yield video, table
 
@@ -237,41 +215,90 @@ def measure_video(path: Path, options: VideoOptions, *, learn: bool, as_json: bo
 
     learn: whether the tail is learned from this video and written to `options.learned`
     """
+    from fishd.camera.tail.beats import average, find_maxima
     from fishd.camera.tail.learned import Learned
 
     if learn and options.learned is None:
         raise click.UsageError("--learn needs --learned FILE for what is learned from a VIDEO")
+    clock: ClockOffset | None = None
     with open_table(path, options, Learned) as (video, table):
         forces = _read_recording(options.recording) if options.recording else None
         with resumable(table):
             learned = _find_learned(video, table, options, learn=learn)
             table.begin(learned)
             examples = _measure_pictures(video, table, learned)
-        numbers, reasons = table.read_numbers((0, 1), reason=5)
-        measured = _Measured(numbers[0], numbers[1], reasons)
+        (times, angles), reasons = table.read_numbers((0, 1), reason=5)
         columns = _COLUMNS + (_MM_COLUMNS if learned.pixels_per_mm else ())
         columns += name_midline("px") if options.has_midline else ()
-        clock, rows = None, table.read()
+        rows: Iterable[list[str]] = table.read()
         if forces:
             from fishd.lab.video_clock import NoOffset, find_offset
 
             try:
-                clock = find_offset(measured.times, measured.angles, forces)
+                clock = find_offset(times, angles, forces)
             except NoOffset as error:
                 raise NoOffset(
                     f"{text.quoted(options.recording or '')}: {error}; without --with, the same "
                     "command writes the table"
                 ) from None
             columns += ("elapsed",)
-            rows = ([*row, _to_elapsed(clock, row)] for row in rows)
+            elapsed = clock.to_recording(times)
+            rows = ([*row, f"{moment:.6f}"] for row, moment in zip(rows, elapsed, strict=True))
         table.finish(columns, rows)
-        zero_ci95 = learned.zero_ci95
-        _print_result(video, zero_ci95, measured, clock, options, examples, as_json=as_json)
+    beats = find_maxima(times.tolist(), angles.tolist())
+    if options.picture:
+        from fishd.lab.fin_angle_figure import draw_fin_angle
+
+        draw_fin_angle(path.name, times, angles, beats, examples, options.picture)
+    mean = average(beats)
+    periods = np.diff([beat.time for beat in beats])
+    # Between neighbours no beat is unknown.
+    periods = periods[periods < [3.0 * (beat.back - beat.time) for beat in beats[:-1]]]
+    frequency = 1.0 / float(np.median(periods)) if len(periods) else None
+    known = int(np.count_nonzero(np.isfinite(angles)))
+    begin, ci95 = clock.begin if clock else (None, None)
+    if as_json:
+        print_json(
+            {
+                "pictures": len(times),
+                "known": known,
+                "unknown": reasons,
+                "zero_ci95": learned.zero_ci95,
+                "fin_angle_max": mean and mean[0],
+                "fin_angle_max_ci95": mean and mean[1],
+                "beats": len(beats),
+                "frequency": frequency,
+                "video_begin": begin,
+                "video_begin_ci95": ci95,
+                "clock_stretch": clock and clock.stretch,
+                "clock_stretch_ci95": clock and clock.stretch_ci95,
+                "table": str(options.target),
+            }
+        )
+        return 0
+    size = f"{video.size[0]} × {video.size[1]} px"
+    maximum = "fewer than two whole beats are seen"
+    if mean:
+        maximum = f"{text.format_measured(*mean, 'rad')} in {len(beats)} beats"
+        maximum += f", {frequency:.3f} Hz" if frequency else ""
+    lines = [
+        ("video", f"{format_count(len(times), 'picture')} of {size}, {video.rate:.4g} a second"),
+        ("fin angle", f"known in {known} of them, zero ± {learned.zero_ci95 * 1e3:.1f} mrad"),
+        *(("", f"{count}: {why}") for why, count in reasons.most_common(_MAX_REASONS)),
+        ("maximum", maximum),
+    ]
+    if clock:
+        pace = "slow" if clock.stretch > 0.0 else "fast"
+        percent = f"{100.0 * abs(clock.stretch):.3f} ± {100.0 * clock.stretch_ci95:.3f} %"
+        lines += [
+            (
+                "recording",
+                f"the video begins {begin:.4f} ± {ci95:.4f} s after its first tick",
+            ),
+            ("", f"the clock of the video is {percent} {pace}"),
+        ]
+    echo_rows([*lines, ("table", str(options.target))])
     return 0
-
-
-def _to_elapsed(clock: "ClockOffset", row: list[str]) -> str:
-    return f"{float(clock.to_recording(np.array(float(row[0])))):.6f}"
 
 
 def _read_recording(name: str) -> "list[Force]":
@@ -342,7 +369,7 @@ def _measure_pictures(
             best = largest.get(side)
             if best is None or side * reading.alpha > side * (best.reading.alpha or 0.0):
                 largest[side] = Example(picture.pixels, reading)
-        return _to_row(reading, learned, has_midline=table.source.has_midline)
+        return _to_row(reading, learned, has_midline=bool(table.source["has_midline"]))
 
     add_rows(video, table, measure, WARM_UP_S)
     return list(largest.values())
@@ -363,70 +390,3 @@ def _to_row(reading: "TailReading", learned: "Learned", *, has_midline: bool) ->
         points = np.array(reading.midline or [(math.nan, math.nan)] * MIDLINE_POINTS)
         row += [format_cell(value, 2) for value in points.T.ravel()]
     return row
-
-
-def _print_result(
-    video: "Video",
-    zero_ci95: float,
-    measured: _Measured,
-    clock: "ClockOffset | None",
-    options: VideoOptions,
-    examples: "list[Example]",
-    *,
-    as_json: bool,
-) -> None:
-    from fishd.camera.tail.beats import average, find_maxima
-
-    times, angles = measured.times, measured.angles
-    beats = find_maxima(times.tolist(), [None if math.isnan(a) else a for a in angles.tolist()])
-    mean = average(beats)
-    periods = np.diff([beat.time for beat in beats])
-    # Between neighbours no beat is unknown.
-    periods = periods[periods < [3.0 * (beat.back - beat.time) for beat in beats[:-1]]]
-    frequency = 1.0 / float(np.median(periods)) if len(periods) else None
-    if options.picture:
-        from fishd.lab.fin_angle_figure import draw_fin_angle
-
-        draw_fin_angle(video.path.name, times, angles, beats, examples, options.picture)
-    known = int(np.count_nonzero(np.isfinite(angles)))
-    if as_json:
-        print_json(
-            {
-                "pictures": len(times),
-                "known": known,
-                "unknown": measured.reasons,
-                "zero_ci95": zero_ci95,
-                "fin_angle_max": mean[0] if mean else None,
-                "fin_angle_max_ci95": mean[1] if mean else None,
-                "beats": len(beats),
-                "frequency": frequency,
-                "video_begin": clock.begin[0] if clock else None,
-                "video_begin_ci95": clock.begin[1] if clock else None,
-                "clock_stretch": clock.stretch if clock else None,
-                "clock_stretch_ci95": clock.stretch_ci95 if clock else None,
-                "table": str(options.target),
-            }
-        )
-        return
-    size = f"{video.size[0]} × {video.size[1]} px"
-    rows = [
-        ("video", f"{format_count(len(times), 'picture')} of {size}, {video.rate:.4g} a second"),
-        ("fin angle", f"known in {known} of them, zero ± {zero_ci95 * 1e3:.1f} mrad"),
-        *(("", f"{count}: {why}") for why, count in measured.reasons.most_common(_MAX_REASONS)),
-        (
-            "maximum",
-            f"{text.format_measured(*mean, 'rad')} in {len(beats)} beats"
-            + (f", {frequency:.3f} Hz" if frequency else "")
-            if mean
-            else "fewer than two whole beats are seen",
-        ),
-    ]
-    if clock:
-        begin, ci95 = clock.begin
-        pace = "slow" if clock.stretch > 0.0 else "fast"
-        percent = f"{100.0 * abs(clock.stretch):.3f} ± {100.0 * clock.stretch_ci95:.3f} %"
-        rows += [
-            ("recording", f"the video begins {begin:.4f} ± {ci95:.4f} s after its first tick"),
-            ("", f"the clock of the video is {percent} {pace}"),
-        ]
-    echo_rows([*rows, ("table", str(options.target))])

@@ -1,6 +1,5 @@
 """Options and helpers of the verbs about a camera: its address, pictures, and the fish."""
 
-import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -13,6 +12,7 @@ import yaml
 from fishd.cli.options import verb_lease
 from fishd.cli.output import echo
 from fishd.client import Fish
+from fishd.core import files
 from fishd.core.errors import FishdError, FishError, NoDaemon
 from fishd.core.process.interruption import raise_on_first_signal
 from fishd.core.signals import Event, Tick
@@ -44,13 +44,12 @@ def check_png(path: Path | None) -> None:
     """Raise `UsageError` if a picture cannot be written, before the verb does anything."""
     if path is None:
         return
-    prefix, folder = f"'{path}' is not valid for --plot: ", path.parent
     if path.suffix.lower() != ".png":
-        raise click.UsageError(f"{prefix}a name ending in .png is needed")
-    if not folder.is_dir():
-        raise click.UsageError(f"{prefix}there is no folder {folder}")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise click.UsageError(f"{prefix}nothing may be written into the folder {folder}")
+        raise click.UsageError(f"'{path}' is not valid for --plot: a name ending in .png is needed")
+    try:
+        files.check_writable(path)
+    except files.FileProblem as problem:
+        raise click.UsageError(f"'{path}' is not valid for --plot: {problem}") from None
 
 
 def format_yaml(settings: dict[str, Any]) -> str:

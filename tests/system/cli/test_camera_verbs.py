@@ -198,10 +198,10 @@ def test_a_picture_that_cannot_be_written_is_refused_before_the_fish_swims(
         done = fishctl("camera", "align", "--swim", "--plot", f"{tmp_path}/nowhere/a.png")
         seen = [ticks.message() for _ in range(3)]
     assert done.returncode == 2
-    assert f"there is no folder {tmp_path}/nowhere" in one_line(done)
+    assert "its folder does not exist; create it" in one_line(done)
     assert {tick["mode"] for tick in seen} == {"idle"}
     looked = fishctl("camera", "view", "--axis", "--plot", f"{tmp_path}/nowhere/a.png")
-    assert f"there is no folder {tmp_path}/nowhere" in one_line(looked)
+    assert "its folder does not exist; create it" in one_line(looked)
 
 
 def test_alignment_needs_a_fish_that_swims(daemon: Daemon) -> None:

@@ -51,6 +51,7 @@ def test_a_video_is_measured_in_the_plane_of_the_tail(folder: Path) -> None:
         done = fishctl(
             "camera", "measure", str(folder / "fish.avi"), "--to", str(table), *words, "--json"
         )
+        assert done.returncode == 0, done.stderr
         maxima.append(json.loads(done.stdout)["fin_angle_max"])
     assert maxima[0] != pytest.approx(0.3, rel=0.01)
     assert maxima[1] == pytest.approx(0.3, rel=0.01)
