@@ -95,18 +95,6 @@ class SimulatedCameraSettings(Struct, frozen=True, forbid_unknown_fields=True, k
 
 
 DEFAULT = SimulatedCameraSettings()
-WEB = SimulatedCameraSettings(
-    rate=30.0,
-    latency=0.05,
-    jitter=0.005,
-    exposure=0.02,
-    noise=6.0,
-    caustics=12.0,
-    side_light=20.0,
-    off_axis=3.0,
-    tilt=0.02,
-)
-"""Settings of a cheap USB camera on a stand."""
 
 
 class TailPainter:

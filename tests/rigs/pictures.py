@@ -1,11 +1,16 @@
-"""Texts in pictures."""
+"""Texts in pictures, and the settings of a simulated camera."""
 
 from contextlib import AbstractContextManager
 from pathlib import Path
 from unittest.mock import patch
 from xml.etree import ElementTree
 
+from fishd.camera.settings import load_simulated
+from fishd.core.files import shipped_folder
 from fishd.lab import drawing
+
+WEB = load_simulated(shipped_folder("config") / "camera-web.yaml")
+"""Settings of a cheap USB camera on a stand."""
 
 
 def texts_in_pictures() -> AbstractContextManager[object]:

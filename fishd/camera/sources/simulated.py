@@ -5,7 +5,6 @@ motion until then is therefore known: a model of the same fish is advanced by on
 state.
 """
 
-import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -49,7 +48,7 @@ class TickTruth(Struct, frozen=True, gc=False):
     seq: int
     phi_c: float
     servo_on: bool
-    time: float = math.nan
+    time: float
     alpha: float | UnsetType = UNSET
     alpha_rate: float = 0.0
     phi: float = 0.0
@@ -210,13 +209,6 @@ class _View:
                 "unusable",
                 kind.hides_from_camera or "this fishd does not publish the position of the tail",
                 "use source: v4l2" if is_real else "start fishd with robot: simulated",
-            )
-        if math.isnan(tick.time):
-            raise Trouble(
-                "unusable",
-                f"fishd {status.version} does not publish the times of its ticks: it is older than "
-                "this camera",
-                "install the same version of both",
             )
         if not self._last_seq:
             self._begin(status)

@@ -17,7 +17,6 @@ from fishd.cli.output import echo, echo_rows, print_json
 from fishd.cli.progress import show_progress
 from fishd.client import Fish
 from fishd.core.console import INTERRUPTED
-from fishd.core.errors import FishdError
 
 if TYPE_CHECKING:
     from fishd.camera.latency import Force, Latency
@@ -74,10 +73,6 @@ def force_windows(ticks: list["Tick"], period: float) -> list["Force"]:
     """
     from fishd.camera.latency import Force
 
-    if ticks and not ticks[-1].time:
-        raise FishdError(
-            "this fishd does not send the times of its ticks: it is older than this fishctl"
-        )
     forces: list[Force] = []
     for tick in ticks:
         sample_interval = period / max(1, tick.samples)

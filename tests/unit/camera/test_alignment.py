@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from rigs.filmed_swim import filmed, swum
+from rigs.pictures import WEB
 
 from fishd.camera.alignment import Alignment, judge
 from fishd.camera.axis import find_motion
 from fishd.camera.settings import CameraSettings, PictureSettings, Square
-from fishd.camera.simulated import WEB
 from fishd.core.camera_frames import Pixels
 
 V4L2 = CameraSettings(source="v4l2")

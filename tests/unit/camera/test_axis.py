@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from rigs.pictures import WEB
 
 from fishd.camera.axis import NoMotion, find_motion
-from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings, TailPainter
+from fishd.camera.simulated import DEFAULT, SimulatedCameraSettings, TailPainter
 from fishd.core.camera_frames import Pixels
 
 BAD = replace(WEB, contrast=50.0, noise=10.0, light_drift=0.3)

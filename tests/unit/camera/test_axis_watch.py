@@ -7,9 +7,10 @@ import pytest
 from msgspec.structs import replace
 from rigs import filmed_swim
 from rigs.filmed_swim import filmed
+from rigs.pictures import WEB
 
 from fishd.camera.axis import SEARCH_PERIOD_S, AxisWatch
-from fishd.camera.simulated import DEFAULT, WEB
+from fishd.camera.simulated import DEFAULT
 from fishd.core.camera_frames import Frame
 
 swum = cache(filmed_swim.swum)  # ticks are immutable

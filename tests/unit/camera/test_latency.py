@@ -7,9 +7,10 @@ import pytest
 from msgspec.structs import replace
 from rigs import filmed_swim
 from rigs.filmed_swim import felt, filmed
+from rigs.pictures import WEB
 
 from fishd.camera.latency import NoDelay, find_latency
-from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings
+from fishd.camera.simulated import DEFAULT, SimulatedCameraSettings
 from fishd.core.camera_frames import Frame
 
 BAD = replace(WEB, contrast=50.0, noise=10.0, light_drift=0.3)

@@ -5,10 +5,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from rigs.pictures import WEB
 
 from fishd.camera.simulated import (
     DEFAULT,
-    WEB,
     SimulatedCamera,
     SimulatedCameraSettings,
     Tail,

@@ -7,9 +7,10 @@ import pytest
 from msgspec.structs import replace
 from rigs import filmed_swim
 from rigs.filmed_swim import filmed
+from rigs.pictures import WEB
 
 from fishd.camera.latency import find_tail_positions
-from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings
+from fishd.camera.simulated import DEFAULT, SimulatedCameraSettings
 
 swum = cache(filmed_swim.swum)  # ticks are immutable
 

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
+from rigs.pictures import WEB
 from rigs.policy_files import seeing_card, velocity_follower, write
 
-from fishd.camera.simulated import DEFAULT, WEB
+from fishd.camera.simulated import DEFAULT
 from fishd.config import Config, load
 from fishd.core.errors import ParameterError
 from fishd.lab.compare import compare
