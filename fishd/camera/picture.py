@@ -1,5 +1,8 @@
 """Conversion of a camera's picture to the frame for learners and the view for people."""
 
+from contextlib import suppress
+from pathlib import Path
+
 import cv2
 import numpy as np
 import simplejpeg
@@ -11,10 +14,12 @@ from fishd.core.camera_frames import Pixels
 _TURNS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
 
-def to_grey(picture: object) -> Pixels:
-    """Return the grey levels of a picture of OpenCV."""
-    pixels = np.asarray(picture, np.uint8)
-    return pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)  # type: ignore[return-value]
+def read_picture(path: Path) -> Pixels | None:
+    """Return the grey levels of the picture in a file; None if it contains none."""
+    picture = None
+    with suppress(cv2.error):  # it is too large
+        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    return None if picture is None else np.asarray(picture, np.uint8)
 
 
 def rotate(picture: Pixels, turn: int) -> Pixels:

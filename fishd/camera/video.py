@@ -13,7 +13,8 @@ os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file"
 
 import cv2
 
-from fishd.camera.picture import rotate, to_grey, turn_read_out
+from fishd.camera.picture import rotate, turn_read_out
+from fishd.camera.sources.stream import to_grey
 from fishd.camera.tail.learned import Learned
 from fishd.camera.tail.learner import CannotLearn, Learner
 from fishd.camera.tail.lens import Lens, Turn

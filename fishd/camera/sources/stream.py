@@ -10,10 +10,11 @@ from pathlib import Path
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 import cv2
+import numpy as np
 
-from fishd.camera.picture import to_grey
 from fishd.camera.settings import StreamSettings, hide_secrets
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
+from fishd.core.camera_frames import Pixels
 from fishd.core.clock import read_boot_id
 
 PAUSES = 1.0, 10.0
@@ -135,3 +136,11 @@ def _open(url: str) -> Iterator[cv2.VideoCapture]:
         yield capture
     finally:
         capture.release()
+
+
+def to_grey(picture: object) -> Pixels:
+    """Return the grey levels of a picture of OpenCV."""
+    pixels = np.asarray(picture, np.uint8)
+    if pixels.ndim == 2:
+        return pixels
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), np.uint8)

@@ -36,6 +36,9 @@ _GROUND_PICTURES = 48
 """Number of pictures from which the ground is learned."""
 _MOTION_WIDTH_PX = 110
 """Largest width of the pictures in which motion is searched [px]."""
+_SWINGS, _MAX_RISE = 0.15, 0.04
+"""Energy of a column that swings, relative to a large one, and the largest distance from where the
+tail begins to such a column, relative to the picture's width."""
 _UNCOVERED = 0.85
 """Quantile of the grey levels of a pixel that shows the ground, beginning with the tail's."""
 _MIN_REST_S = 0.4
@@ -215,15 +218,20 @@ class _Scene:
         except NoMotion:
             raise CannotLearn(_NOTHING_SWINGS) from None
         height, width = motion.energy.shape
-        strong = motion.energy > 0.02 * float(np.quantile(motion.energy, 0.99))
+        energy = motion.energy / max(float(np.quantile(motion.energy, 0.99)), 1e-12)
+        strong = energy > 0.02
         count, labels, sizes, _ = cv2.connectedComponentsWithStats(strong.astype(np.uint8))
         if count < 2:
             raise CannotLearn(_NOTHING_SWINGS)
         largest = 1 + int(sizes[1:, cv2.CC_STAT_AREA].argmax())
         mask = (labels == largest).astype(np.uint8)
-        columns = np.flatnonzero(mask.sum(axis=0) >= 2)
+        begin = int((mask.sum(axis=0) >= 2).argmax())
+        swings = int(((mask * energy).max(axis=0) > _SWINGS).argmax())
+        if swings - begin > _MAX_RISE * width:  # waves move the edges of the body, too
+            begin = swings - 1
+            mask[:, :begin] = 0
         scale = self.size[0] / width
-        column = float(columns[0])
+        column = float(begin)
         row = float(motion.axis.rows(height, width)[int(column)])
         self.pose = Pose(
             ((column + 0.5) * scale - 0.5, (row + 0.5) * scale - 0.5), motion.axis.tilt

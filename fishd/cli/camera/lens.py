@@ -1,7 +1,6 @@
 """The verb that calibrates the lens of a camera, and its view of the plane of the tail."""
 
 from collections.abc import Iterator
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -181,17 +180,12 @@ def _calibrate_from_files(
 
 def _read_pictures(path: Path, turn: "Turn") -> "Iterator[tuple[float | None, Pixels]]":
     """Yield the turned pictures of a file and their times [s]; a single one has none."""
-    import cv2
-    import numpy as np
-
-    from fishd.camera.picture import rotate
+    from fishd.camera.picture import read_picture, rotate
     from fishd.camera.video import Video
 
-    picture = None
-    with suppress(cv2.error):  # it is too large
-        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    picture = read_picture(path)
     if picture is not None:
-        yield None, rotate(np.asarray(picture, np.uint8), turn)
+        yield None, rotate(picture, turn)
         return
     with Video(path, None, turn) as video:
         for each in video.pictures():

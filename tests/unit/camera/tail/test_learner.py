@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from rigs.filmed_tail import FIN_FROM, Film, FilmedTail, rest_before, sine
-from rigs.measured_tail import CASES, learn
+from rigs.measured_tail import CASES, WEB, learn
 
 from fishd.camera.tail.learner import CannotLearn, Learner
 
@@ -100,3 +100,8 @@ def test_minutes_of_large_pictures_are_kept_in_little_memory() -> None:
         assert tracemalloc.get_traced_memory()[0] < 36e6
     finally:
         tracemalloc.stop()
+
+
+def test_the_edges_of_a_body_that_waves_move_are_not_the_tail() -> None:
+    film = replace(CASES[WEB], seed=200)
+    assert learn(film).root[0] == pytest.approx(film.width * film.root[0], abs=0.06 * film.width)
