@@ -309,6 +309,17 @@ def test_a_recording_of_another_swim_costs_no_measurement(
     assert pandas.read_csv(target).fin_angle.equals(measured[0].fin_angle)
 
 
+def test_a_video_with_a_broken_end_is_measured_up_to_there(
+    video: Path, measured: Result, tmp_path: Path
+) -> None:
+    broken, content = tmp_path / "broken.avi", video.read_bytes()
+    broken.write_bytes(content[: len(content) // 2])
+    done = measure(broken, tmp_path / "a.csv", "--learned", measured[2] / "fish.bin")
+    assert done.returncode == 0
+    rows = len(pandas.read_csv(tmp_path / "a.csv"))
+    assert f"ends after {rows} of {len(measured[0])} pictures: it is damaged" in done.stderr
+
+
 def test_a_video_of_another_size_than_the_learned_one_is_refused(
     measured: Result, tmp_path: Path
 ) -> None:
