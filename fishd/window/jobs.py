@@ -203,10 +203,8 @@ class Jobs:
         self, form: Form | None, options: Any, fish: str, endpoint: list[str]
     ) -> tuple[Job, list[str]]:
         """Return a job whose folders exist then, and the arguments of fishctl."""
-        try:
+        with files.os_errors(JobError, f"{self._folder} cannot be created"):
             self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise JobError(f"{self._folder} cannot be created: {error.strerror}") from None
         if form is None:
             return self._resume(options, fish, endpoint)
         kind = form.kind

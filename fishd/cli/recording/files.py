@@ -28,9 +28,17 @@ from fishd.recording.folder import (
 from fishd.recording.part_file import SUFFIX
 from fishd.recording.reader import RECOVERED
 
+
+def _choose_folder(context: click.Context, _: click.Parameter, folder: Path | None) -> Path:
+    """Return the folder of runs: of this verb, else of `fishctl runs --folder`."""
+    given = context.parent.params.get("folder") if context.parent else None
+    return folder or given or runs_folder()
+
+
 folder_option = click.option(
     "--folder",
     type=click.Path(path_type=Path, file_okay=False),
+    callback=_choose_folder,
     help="Folder with recordings, such as that of an experiment; default: "
     f"${FOLDER_VARIABLE}, else runs in the current folder.",
 )
@@ -96,7 +104,7 @@ def export(
     form: str | None,
     target: Path | None,
     force: bool,
-    folder: Path | None,
+    folder: Path,
     as_json: bool,
 ) -> None:
     """Write a recording as tables: one row a tick, and a second file with its events.
@@ -129,7 +137,7 @@ def plot(
     end: float | None,
     target: Path | None,
     force: bool,
-    folder: Path | None,
+    folder: Path,
     as_json: bool,
 ) -> None:
     """Draw forces, command, thrust, the controller's own quantities, and a phase portrait.
@@ -180,13 +188,13 @@ def _picture_path(target: Path, name: str, force: bool) -> Path:
     return path
 
 
-def _find_experiment(run: str, folder: Path | None) -> Path | None:
+def _find_experiment(run: str, folder: Path) -> Path | None:
     """Return the folder of an experiment; None for a recording."""
-    path = files.expand_user(run) if "/" in run else (folder or runs_folder()) / run
+    path = files.expand_user(run) if "/" in run else folder / run
     return path if (path / EXPERIMENT).is_file() else None
 
 
-def _open_plotted(run: str, experiment: Path | None, folder: Path | None) -> Run | None:
+def _open_plotted(run: str, experiment: Path | None, folder: Path) -> Run | None:
     """Open a recording, or the last one of an experiment; None for one without a recording."""
     if experiment is None:
         return open_recording(run, folder)
@@ -213,7 +221,7 @@ def _draw_experiment(folder: Path, path: Path) -> None:
 @click.argument("file")
 @folder_option
 @json_option
-def recover(file: str, folder: Path | None, as_json: bool) -> None:
+def recover(file: str, folder: Path, as_json: bool) -> None:
     """Repair a recording that was cut off by a kill, a full disk or a power cut, or is damaged.
 
     FILE is a path, a name in the folder of recordings, or 'latest'. NAME.mcap.part becomes
@@ -262,7 +270,7 @@ def replay(
     speed: float,
     address: str,
     control: str | None,
-    folder: Path | None,
+    folder: Path,
     as_json: bool,
 ) -> None:
     """Publish a recording as fishd would, so that `fishctl watch` and PlotJuggler show it.
