@@ -11,7 +11,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import msgspec
 from aiohttp import web
 
 from fishd import __version__
@@ -21,7 +20,7 @@ from fishd.core.clock import read_boot_id
 from fishd.core.errors import FishError
 from fishd.window.access import AccessControl
 from fishd.window.answers import ApiError, NoArguments
-from fishd.window.children import JobError, call
+from fishd.window.children import JobError, call_json
 from fishd.window.fish_link import FishLink
 from fishd.window.metrics import measure_disk
 from fishd.window.pages import Pages
@@ -98,7 +97,7 @@ class InspectionRequests:
     async def _run_doctor(self, link: FishLink) -> Any:
         """Return the results of `fishctl doctor --json`; raise `JobError`."""
         words = ["doctor", "--json", *link.endpoint_options]
-        return msgspec.json.decode(await call(words, self._runs.folder))
+        return await call_json(words, self._runs.folder)
 
     async def _read_disk(self, link: FishLink) -> Row:
         """Return the free space for recordings [bytes], and the bytes of an hour."""
@@ -119,8 +118,8 @@ class InspectionRequests:
     async def _read_settings(self, link: FishLink) -> Row:
         """Return the keys of the configuration, and the calibrations; raise `FishdError`."""
         if not self._defaults:
-            output = await call(["config", "show", "--json"], self._runs.folder)
-            self._defaults = dict(_flatten(msgspec.json.decode(output)))
+            words = ["config", "show", "--json"]
+            self._defaults = dict(_flatten(await call_json(words, self._runs.folder)))
         settings, calibrations = await link.read_settings()
         missing = object()
         keys = [

@@ -53,7 +53,7 @@ class RunRequests:
             change("delete", lambda body: (), NoArguments),
             access.get("/api/results", self._show_results, waiting),
             access.get("/api/results.png", self._draw_results, waiting),
-            access.get("/api/trash", lambda _: runs.call_json("trash"), waiting),
+            access.get("/api/trash", lambda _: runs.call_verb("trash"), waiting),
             access.post("/api/trash/{id}/restore", self._restore, NoArguments, waiting=waiting),
         ]
 
@@ -74,7 +74,7 @@ class RunRequests:
         return await self._runs.change("restore", deleted)
 
     async def _show_results(self, request: web.Request) -> Any:
-        return await self._runs.call_json("show", *_list_compared(request))
+        return await self._runs.call_verb("show", *_list_compared(request))
 
     async def _draw_results(self, request: web.Request) -> web.Response:
         picture = await self._runs.plot_over_each_other(_list_compared(request))
