@@ -1,6 +1,5 @@
 """Requests of a page that change runs, compare and download them; fishctl carries them out."""
 
-import re
 from collections.abc import Callable
 from functools import partial
 from typing import Annotated, Any
@@ -16,7 +15,6 @@ from fishd.window.downloads import ENDINGS, Downloads
 from fishd.window.runs import Runs, check_name
 
 MAX_COMPARED_RUNS = 12
-_TRASH_ID = re.compile(r"\d{8}-\d{6}(-\d+)?", re.A)
 
 
 class NewNote(Struct, forbid_unknown_fields=True):
@@ -68,10 +66,7 @@ class RunRequests:
         return await self._downloads.send(request, run, file, device, check)
 
     async def _restore(self, request: web.Request, _: NoArguments) -> Any:
-        deleted = request.match_info["id"]
-        if not _TRASH_ID.fullmatch(deleted):
-            raise ApiError(404, "not-found", f"the trash has no '{text.quoted(deleted)}'")
-        return await self._runs.change("restore", deleted)
+        return await self._runs.change("restore", check_name(request.match_info["id"]))
 
     async def _show_results(self, request: web.Request) -> Any:
         return await self._runs.call_verb("show", *_list_compared(request))

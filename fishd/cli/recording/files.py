@@ -148,7 +148,7 @@ def plot(
     recording is left out.
     """
     from fishd.lab.run_figure import draw_run, draw_runs
-    from fishd.lab.run_traces import traces
+    from fishd.lab.run_traces import Traces, traces
 
     experiments = [_find_experiment(run, folder) for run in runs]
     if any(experiments) and (begin or end is not None):
@@ -158,26 +158,24 @@ def plot(
         _draw_experiment(experiment, path)
         print_paths([path], as_json)
         return
-    pairs = list(zip(runs, experiments, strict=True))
-    recordings = {
-        experiment.name if experiment else run: _open_plotted(run, experiment, folder)
-        for run, experiment in pairs
-    }
-    left_out = [name for name, recording in recordings.items() if recording is None]
-    kept = {name: recording for name, recording in recordings.items() if recording}
-    if not kept:
+    drawn: list[tuple[str, Traces]] = []
+    left_out, first = list[str](), None
+    for run, experiment in zip(runs, experiments, strict=True):
+        name = experiment.name if experiment else run.rpartition("/")[2].removesuffix(SUFFIX)
+        if recording := _open_plotted(run, experiment, folder):
+            first = first or recording
+            drawn.append((name, traces(recording, begin, math.inf if end is None else end)))
+        else:
+            left_out.append(name)
+    if first is None:
         raise FishdError(f"nothing can be drawn: no recording in {', '.join(left_out)}")
-    last = math.inf if end is None else end
-    drawn = {name: traces(recording, begin, last) for name, recording in kept.items()}
-    first = next(iter(kept.values()))
-    name = first.name if len(runs) == 1 else f"{first.name}-compared"
+    is_single = len(runs) == 1
+    name = first.name if is_single else f"{first.name}-compared"
     path = _picture_path(target or first.path.parent, name, force)
-    if len(runs) == 1:
-        draw_run(drawn[runs[0]], path)
+    if is_single:
+        draw_run(drawn[0][1], path)
     else:
-        draw_runs(
-            {n.rpartition("/")[2].removesuffix(SUFFIX): t for n, t in drawn.items()}, left_out, path
-        )
+        draw_runs(drawn, left_out, path)
     print_paths([path], as_json)
 
 
