@@ -79,11 +79,16 @@ def start(log_format: str, **values: Any) -> None:
 
 
 @window.command(hidden=True)
-def forms() -> None:
-    """Print the forms of the page's experiments as JSON."""
+@json_option
+def forms(as_json: bool) -> None:
+    """List the forms of the page's experiments."""
     from fishd.cli.forms import describe_forms
 
-    print_json(describe_forms())
+    described = describe_forms()
+    if as_json:
+        print_json(described)
+    for form in () if as_json else described:
+        echo(f"{form.title}: {form.about}")
 
 
 @window.command()

@@ -38,7 +38,7 @@ class Forms:
         """Return the forms by their kinds; raise `JobError`."""
         async with self._reading:
             if not self._known:
-                forms = await call_json(["window", "forms"], self._runs, _decode_forms)
+                forms = await call_json(["window", "forms", "--json"], self._runs, _decode_forms)
                 self._known = {form.kind: KnownForm(form, make_options(form)) for form in forms}
         return self._known
 

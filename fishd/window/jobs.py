@@ -23,7 +23,7 @@ from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError
 from fishd.core.experiments import PROGRESS_PREFIX, CurvePoint, Form, Plan, Progress
 from fishd.window.children import JobError, spawn
-from fishd.window.curves import read_curve
+from fishd.window.exports import read_curve
 from fishd.window.forms import Forms
 from fishd.window.job_options import ResumeOptions, list_words, swims
 from fishd.window.runs import Runs
