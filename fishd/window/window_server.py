@@ -81,7 +81,6 @@ class WindowServer(WebServer):
             readers={"/foxglove": frozenset(settings.origins)},
             is_paired=access.is_paired,
             max_body_bytes=MAX_BODY_BYTES,
-            advice="name another one with --listen",
         )
 
     async def __aenter__(self) -> Self:

@@ -234,6 +234,6 @@ async def test_half_a_request_is_ended_soon(sent: bytes, monkeypatch: pytest.Mon
 async def test_a_port_that_is_taken_is_one_line() -> None:
     async with run_server() as (server, _):
         port = int(server.url.rsplit(":", 1)[1].strip("/"))
-        with pytest.raises(StartupError, match=r"cannot serve a page at .*; name another port"):
+        with pytest.raises(StartupError, match=r"cannot serve a page at .*; name another one with"):
             async with PageServer("127.0.0.1", port):
                 pass
