@@ -65,7 +65,9 @@ class QueueRunner:
                     if not self._finish(item, self._run(item)):
                         break
         queue = self._file.read()
-        _say(f"fishctl: the queue {f'pauses: {queue.reason}' if queue.reason else 'is empty'}")
+        _print_line(
+            f"fishctl: the queue {f'pauses: {queue.reason}' if queue.reason else 'is empty'}"
+        )
         if self._is_stopped:
             return INTERRUPTED
         return 0 if not queue.reason or self._is_requested else 1
@@ -122,7 +124,7 @@ class QueueRunner:
         take = ["--take"] if self._take else []
         words = ["--endpoint", self._file.address, *place, str(folder), *take]
         self._take, self._last_line = False, ""
-        _say(f"fishctl: experiment {item.id}: {' '.join(item.words)}")
+        _print_line(f"fishctl: experiment {item.id}: {' '.join(item.words)}")
         try:
             # Another session, as Ctrl-C in this terminal is for the runner.
             child = subprocess.Popen(
@@ -169,7 +171,7 @@ class QueueRunner:
             for line in lines:
                 if not line.startswith(PROGRESS_PREFIX.decode()):  # which is for a page
                     self._last_line = text.line(line).removeprefix("fishctl: ")
-                _say(line.rstrip())
+                _print_line(line.rstrip())
 
     def _finish(self, item: Item, status: int) -> bool:
         """Keep the outcome of a run; return whether the queue goes on."""
@@ -197,7 +199,7 @@ class QueueRunner:
         return outcome != "failed"
 
 
-def _say(line: str) -> None:
+def _print_line(line: str) -> None:
     """Print a line; where the terminal is gone, the queue goes on without it."""
     with suppress(OSError):
         echo(line, err=True)

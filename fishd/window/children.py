@@ -47,7 +47,7 @@ async def call(words: list[str], runs: Path) -> bytes:
     try:
         output, errors = await process.communicate()
     finally:
-        if process.returncode is None:  # nobody waits for it any more
+        if process.returncode is None:  # the request has ended before
             with suppress(ProcessLookupError):
                 process.kill()
     if process.returncode and not output:
