@@ -102,7 +102,7 @@ class _ExperimentSummary(Struct):
     duration: float | None = None
     """Tank time of the result, else time from begin to end; None where neither is known [s]."""
     about: dict[str, str] = {}
-    """Note of the experiment, if it has one."""
+    """Note of the experiment and name of its fish (`subject`), where it has them."""
 
     @classmethod
     def read(cls, path: Path, header: "Header | ConfigError") -> "_ExperimentSummary":
@@ -126,7 +126,7 @@ class _ExperimentSummary(Struct):
             command=header.command,
             problem=answer.problem,
             duration=_find_duration(header) if answer.seconds is None else answer.seconds,
-            about=read_note(path),
+            about=_name_fish(header) | read_note(path),
         )
 
 
@@ -136,6 +136,12 @@ def _find_duration(header: Header) -> float | None:
         begin, end = map(datetime.fromisoformat, (header.began, header.ended or ""))
         return max(0.0, (end - begin).total_seconds())
     return None
+
+
+def _name_fish(header: Header) -> dict[str, str]:
+    """Return the name of the fish in its configuration, as the subject of an experiment."""
+    name = header.config.get("name")
+    return {"subject": name} if isinstance(name, str) else {}
 
 
 def _find_state(path: Path, header: Header) -> str:

@@ -119,7 +119,9 @@ export class Chart {
     this.plot.batch(() => {
       this.plot.setData(this.data, false);
       this.plot.setScale("x", { min, max });
+      if (this.isLive !== this.owner.view.isLive) this.plot.redraw(false, true); // "latest" and times are other labels
     });
+    this.isLive = this.owner.view.isLive;
     this.read();
   }
 
