@@ -21,7 +21,14 @@ from msgspec.structs import replace
 from fishd.core import files, text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError
-from fishd.core.experiments import EXPERIMENT_PREFIX, PROGRESS_PREFIX, CurvePoint, Form, Plan, Progress
+from fishd.core.experiments import (
+    EXPERIMENT_PREFIX,
+    PROGRESS_PREFIX,
+    CurvePoint,
+    Form,
+    Plan,
+    Progress,
+)
 from fishd.window.children import JobError, spawn
 from fishd.window.curves import read_curve
 from fishd.window.forms import Forms

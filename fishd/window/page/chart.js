@@ -142,7 +142,7 @@ export class Chart {
     return {
       width: 300,
       height: HEIGHT,
-      padding: [() => (owner.first === this ? 15 : 6), () => (owner.view.isLive ? 16 : 24), 0, 0],
+      padding: [() => (owner.first === this ? 15 : 6), () => (owner.view.isLive ? 16 : 28), 0, 0],
       pxAlign: 1,
       legend: { show: false },
       cursor: { sync: { key: "fish", setSeries: false }, drag: { x: false, y: false }, points: { size: 6 } },
