@@ -116,8 +116,9 @@ def record(
 ) -> None:
     """Record a running fish: every tick, event and status.
 
-    Ctrl-C or SIGTERM ends it. RUN is a name in the folder of recordings or a path; by default the date and time. The
-    recording survives a restart of fishd. No older recording is ever overwritten.
+    Ctrl-C or SIGTERM ends it. RUN is a name in the folder of recordings or a path; by default the
+    date and time. The recording survives a restart of fishd. No older recording is ever
+    overwritten.
 
     Exit status: 0 if every tick is in the file; 3 if ticks or frames were lost, or may have been,
     as a line then says; 1 if the recording could not begin or the disk failed. A black box reports
