@@ -176,10 +176,8 @@ def _swim_experiment(run: Run, seconds: float) -> "tuple[Config, list[Any], Serv
 
 
 def _write_config(target: Path, text: str) -> None:
-    try:
+    with files.os_errors(FishdError, f"{target}: cannot be written"):
         files.write_atomically(target, text)
-    except OSError as error:
-        raise FishdError(f"{target}: cannot be written: {error.strerror}") from None
     echo(
         f"{target}: written; to swim it: fishctl simulate swing --config {shlex.quote(str(target))}"
     )

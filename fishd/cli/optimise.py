@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import click
+from msgspec import to_builtins
 from msgspec.structs import replace
 
 from fishd.cli.controller_arguments import ParameterType
 from fishd.cli.experiment import ChosenFish, ResumableGroup, Run, experiment_options
 from fishd.cli.options import FiniteRange, seed_option
 from fishd.cli.output import echo, format_count, warn_of_fin
+from fishd.cli.progress import format_estimate
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.core import text
@@ -174,13 +176,12 @@ def _optimise(
         optimum = replace(optimum, choice_time=choice.waited)
     else:
         optimum = _add_truth(optimum, run.fish, fixed)
+    estimates = _list_estimates(optimum, units)
     run.show(
         optimum,
         lambda: _print_optimum(optimum, session.unit, units, run.folder),
-        estimates=[
-            *_list_estimates(optimum, units),
-            error_budget.estimate_thrust("thrust there", optimum, session.unit),
-        ],
+        kept=to_builtins(optimum) | {"summary": ", ".join(map(format_estimate, estimates))},
+        estimates=[*estimates, error_budget.estimate_thrust("thrust there", optimum, session.unit)],
     )
     _draw(run, search, trials, proposal, units, _axis_label(aim, session.unit))
     run.check(f"{format_count(len(trials), 'candidate')} are kept")

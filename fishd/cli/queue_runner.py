@@ -6,6 +6,7 @@ itself.
 """
 
 import os
+import signal
 import subprocess
 import threading
 import time
@@ -19,12 +20,14 @@ from fishd.core.console import INTERRUPTED
 from fishd.core.errors import ConfigError, FishError
 from fishd.core.experiment_queue import MAX_PAST, Item, Outcome, Past, Queue, QueueError, QueueFile
 from fishd.core.experiments import EXPERIMENT_PREFIX, PROGRESS_PREFIX
+from fishd.core.process.fishctl_child import fishctl_command
 from fishd.core.process.interruption import SIGNALS, handle_signals
 from fishd.lab.experiment import Header, find_answer, read_header
-from fishd.window.children import fishctl_command
 
 _NEVER_RESUMED = (2, os.EX_CONFIG)
 """Exit statuses of a run that would fail in the same way if it was resumed."""
+_INTERRUPTED = (INTERRUPTED, -signal.SIGTERM)
+"""Exit statuses of a run that was interrupted, also while its process was starting."""
 POLL_S = 0.25
 """Time between two looks for a request to pause at once [s]."""
 
@@ -62,9 +65,8 @@ class QueueRunner:
                     if not self._finish(item, self._run(item)):
                         break
         queue = self._file.read()
-        echo(
-            f"fishctl: the queue {f'pauses: {queue.reason}' if queue.reason else 'is empty'}",
-            err=True,
+        _print_line(
+            f"fishctl: the queue {f'pauses: {queue.reason}' if queue.reason else 'is empty'}"
         )
         if self._is_stopped:
             return INTERRUPTED
@@ -122,7 +124,7 @@ class QueueRunner:
         take = ["--take"] if self._take else []
         words = ["--endpoint", self._file.address, *place, str(folder), *take]
         self._take, self._last_line = False, ""
-        echo(f"{EXPERIMENT_PREFIX.decode()}{item.id}: {' '.join(item.words)}", err=True)
+        _print_line(f"{EXPERIMENT_PREFIX.decode()}{item.id}: {' '.join(item.words)}")
         try:
             # Another session, as Ctrl-C in this terminal is for the runner.
             child = subprocess.Popen(
@@ -165,11 +167,11 @@ class QueueRunner:
 
     def _read_lines(self, child: "subprocess.Popen[str]") -> None:
         assert child.stderr
-        for line in child.stderr:
-            if not line.startswith(PROGRESS_PREFIX.decode()):  # which is for a page
-                self._last_line = text.line(line).removeprefix("fishctl: ")
-            with suppress(OSError):  # the terminal is gone; the run goes on
-                echo(line.rstrip(), err=True)
+        with child.stderr as lines:
+            for line in lines:
+                if not line.startswith(PROGRESS_PREFIX.decode()):  # which is for a page
+                    self._last_line = text.line(line).removeprefix("fishctl: ")
+                _print_line(line.rstrip())
 
     def _finish(self, item: Item, status: int) -> bool:
         """Keep the outcome of a run; return whether the queue goes on."""
@@ -179,7 +181,7 @@ class QueueRunner:
         message = self._last_line.partition("; resume with:")[0]
         if status == 0 or (header and header.ended):  # such as a budget that is used up
             outcome, message = "done", _describe_answer(folder, header)
-        elif status == INTERRUPTED and self._is_interruption_due():
+        elif status in _INTERRUPTED and self._is_interruption_due():
             outcome = "stopped"
         with self._file.changing() as queue:
             kept = queue.find(item.id)
@@ -195,6 +197,12 @@ class QueueRunner:
             if outcome == "failed":
                 queue.reason = f"experiment {item.id} failed: {message or f'status {status}'}"
         return outcome != "failed"
+
+
+def _print_line(line: str) -> None:
+    """Print a line; where the terminal is gone, the queue goes on without it."""
+    with suppress(OSError):
+        echo(line, err=True)
 
 
 def _read_header(folder: Path) -> Header | None:

@@ -203,36 +203,30 @@ class QueueFile:
 
         Raise `QueueError`, without a change of the file.
         """
+        problem = f"{self.path} cannot be written"
         try:
-            self.runs.mkdir(parents=True, exist_ok=True)
-            with locked(self.path, timeout=LOCK_TIMEOUT_S):
-                queue = self.read()
-                if self.find_runner() is None:
-                    _forget_killed_runner(queue)
-                yield queue
-                write_atomically(self.path, msgspec.json.format(msgspec.json.encode(queue)))
-                sync_folder(self.runs)
+            with files.os_errors(QueueError, problem, "the queue is unchanged"):
+                self.runs.mkdir(parents=True, exist_ok=True)
+                with locked(self.path, timeout=LOCK_TIMEOUT_S):
+                    queue = self.read()
+                    if self.find_runner() is None:
+                        _forget_killed_runner(queue)
+                    yield queue
+                    write_atomically(self.path, msgspec.json.format(msgspec.json.encode(queue)))
+                    sync_folder(self.runs)
         except LockHeld as held:
             raise QueueError(f"{self.path} is being changed by process {held.pid}") from None
-        except FishdError:  # some of these are OSErrors, too
-            raise
-        except OSError as error:
-            raise QueueError(
-                f"{self.path} cannot be written: {error.strerror}; the queue is unchanged"
-            ) from None
 
     @contextmanager
     def running(self) -> Iterator[None]:
         """Be the runner while this lasts; raise `QueueError` if there is one."""
         with ExitStack() as stack:
             try:
-                self.runs.mkdir(parents=True, exist_ok=True)
-                stack.enter_context(locked(self._runner, timeout=RUNNER_TIMEOUT_S))
+                with files.os_errors(QueueError, f"{self._runner}.lock cannot be written"):
+                    self.runs.mkdir(parents=True, exist_ok=True)
+                    stack.enter_context(locked(self._runner, timeout=RUNNER_TIMEOUT_S))
             except LockHeld as held:
                 raise QueueError(f"process {held.pid} runs this queue already") from None
-            except OSError as error:
-                message = f"{self._runner}.lock cannot be written: {error.strerror}"
-                raise QueueError(message) from None
             yield
 
     def find_runner(self) -> str | None:

@@ -5,9 +5,11 @@ A read never blocks, whether the name belongs to a pipe, a device or a file with
 
 import os
 import stat
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from fishd.core.errors import FishdError
 
 MAX_SETTINGS_BYTES = 64 * 2**10
 """Maximum size of a hand-written file [bytes]."""
@@ -31,6 +33,18 @@ class FileProblem(Exception):
 
 class NoFile(FileProblem):
     """The file does not exist."""
+
+
+@contextmanager
+def os_errors(kind: type[FishdError], problem: str, remedy: str = "") -> Iterator[None]:
+    """Raise an error of this kind in place of an OSError: the problem, the reason, the remedy."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, FishdError):
+            raise
+        reason = f"{error.strerror or error}{remedy and f'; {remedy}'}"
+        raise kind(f"{problem}: {reason}") from None
 
 
 def read(path: Path, longest: int, reader: str) -> bytes:

@@ -246,10 +246,8 @@ def mark_folder(path: Path, kind: str, on: On, command: Sequence[str] = ()) -> N
 
 
 def _make_folder(path: Path) -> None:
-    try:
+    with files.os_errors(ConfigError, f"{path}: the folder cannot be created"):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{path}: the folder cannot be created: {error.strerror}") from None
 
 
 def _with_start(path: Path, header: Header) -> Header:
@@ -265,14 +263,12 @@ def _now() -> str:
 
 def check_free(path: Path) -> None:
     """Raise `ConfigError` where a folder exists and is not empty."""
-    try:
+    with files.os_errors(ConfigError, f"{path}: the folder cannot be created"):
         if path.exists() and any(not file.name.endswith(".lock") for file in path.iterdir()):
             hint = f"resume it with --resume {path}, or " if (path / HEADER).exists() else ""
             raise ConfigError(
                 f"{path}: the folder is not empty; {hint}choose another with --folder"
             )
-    except OSError as error:
-        raise ConfigError(f"{path}: the folder cannot be created: {error.strerror}") from None
 
 
 def read_header(path: Path) -> Header:
@@ -325,7 +321,7 @@ class Answer(NamedTuple):
     """The same with the calibration [N]; None where that is not known."""
     summary: str = ""
     """Result other than a thrust, in words."""
-    seconds: float | None = None
+    duration: float | None = None
     """Tank time; None where the result does not have it [s]."""
     problem: str = ""
     """Reason why the result cannot be read; empty if it can, or if there is none."""
@@ -345,7 +341,7 @@ def find_answer(path: Path, kind: str = "") -> Answer:
             read_number(result.get("thrust")),
             read_number(result.get("thrust_ci95")),
             read_number(result.get("total_ci95")),
-            text.line(str(result.get("summary", "") or _describe_parameters(result))),
+            text.line(str(result.get("summary", ""))),
             read_number(result.get("tank_time", result.get("seconds"))),
         )
         for result in results
@@ -379,20 +375,6 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         return [dict(zip(head, row, strict=False)) for row in rows]
     except FileProblem:
         return []
-
-
-def _describe_parameters(result: Mapping[str, Any]) -> str:
-    """Return the best parameters of a search with their intervals; empty for anything else."""
-    lows, highs = result.get("parameters_ci95_low"), result.get("parameters_ci95_high")
-    if not (isinstance(lows, dict) and isinstance(highs, dict)):
-        return ""
-    known = {name: tuple(map(read_number, (low, highs.get(name)))) for name, low in lows.items()}
-    values = [
-        f"{name}={value:.4g} [{low:.4g}, {high:.4g}]"
-        for name, (low, high) in known.items()
-        if None not in (value := read_number(result["parameters"].get(name)), low, high)
-    ]
-    return f"best: {', '.join(values)}" if values else ""
 
 
 def read_number(value: Any) -> float | None:

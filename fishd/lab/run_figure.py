@@ -28,7 +28,7 @@ from fishd.lab.run_traces import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
@@ -77,20 +77,20 @@ def draw_run(traces: Traces, path: str | os.PathLike[str]) -> None:
 
 
 def draw_runs(
-    runs: "Mapping[str, Traces]", left_out: "Sequence[str]", path: str | os.PathLike[str]
+    runs: "Sequence[tuple[str, Traces]]", left_out: "Sequence[str]", path: str | os.PathLike[str]
 ) -> None:
     """Write a figure with several runs over each other: thrust, beat, and mean beat of each.
 
-    runs: traces by the name of their run; time begins with the swim
+    runs: name and traces of each run; time begins with the swim
     left_out: names of runs that have no recording
 
     Raises `FishdError` where writing fails, and `MissingPackage`.
     """
     colours = (BLUE, ORANGE, GREEN, PURPLE, YELLOW, BLACK)
-    units = sorted({traces.unit for traces in runs.values()})
+    units = sorted({traces.unit for _, traces in runs})
     with open_figure(path, (10.0, 6.4)) as figure:
         thrust, beat, force = figure.subplots(3, 1)
-        for index, (name, traces) in enumerate(runs.items()):
+        for index, (name, traces) in enumerate(runs):
             style = {"color": colours[index % len(colours)]}
             style |= {"linestyle": "-" if index < len(colours) else "--"}
             running = np.isfinite(traces.thrust) & (np.nan_to_num(traces.frequency) > 0.0)

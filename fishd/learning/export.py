@@ -37,7 +37,7 @@ from fishd.controllers.policy.network import Sight, to_onnx
 from fishd.controllers.policy.runtime import Network
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import FishdError, PolicyError
-from fishd.core.files import write_atomically
+from fishd.core.files import os_errors, write_atomically
 from fishd.core.text import describe_error, line, quoted
 from fishd.learning.env.environment import SwimEnv, features
 from fishd.learning.env.evaluation import Evaluation, evaluate_in_simulation
@@ -306,11 +306,9 @@ def _write(target: Path, card: Card, policy: ActorCriticPolicy, perception: Perc
     content = _build(target, card, policy, perception)
     if not target.name or (target.exists() and not target.is_file()):
         raise PolicyError(f"{target}: exists already, and is not a regular file")
-    try:
+    with os_errors(PolicyError, f"{target}: cannot be written"):
         target.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(target, content)
-    except OSError as error:
-        raise PolicyError(f"{target}: cannot be written: {error.strerror}") from None
     return len(content)
 
 

@@ -14,7 +14,7 @@ from pandas.api.types import is_numeric_dtype
 
 from fishd.core import text
 from fishd.core.errors import RecordingError
-from fishd.core.files import write_atomically
+from fishd.core.files import os_errors, write_atomically
 from fishd.recording.folder import check_new_files
 from fishd.recording.images import RecordedFrame
 from fishd.recording.reader import Run
@@ -52,13 +52,11 @@ def export(run: Run, path: Path, *, replace: bool = False) -> list[Path]:
     if form == ".parquet":
         about = msgspec.json.encode({"about": run.about, "configs": run.configs})
     for path, table in tables.items():
-        try:
+        with os_errors(RecordingError, f"{path} cannot be written"):
             if form == ".csv":
                 write_atomically(path, _escape_texts(table).to_csv(index=False))
             else:
                 _write_parquet(path, table, about, run)
-        except OSError as error:
-            raise RecordingError(f"{path} cannot be written: {error.strerror or error}") from None
     if run.frame_heads:
         _write_pictures(pictures, run)
         return [*tables, pictures]
@@ -104,22 +102,19 @@ def _write_pictures(path: Path, run: Run) -> None:
     shape = (len(run.frame_heads), *first.pixels.shape)
     part = path.with_name(path.name + ".part")
     try:
-        _check_room(path, math.prod(shape))
-        array = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
-        for number, frame in enumerate(itertools.chain([first], frames)):
-            if frame.pixels.shape != first.pixels.shape:
-                raise RecordingError(
-                    f"{run.path}: frames of {_format_size(first)} and of {_format_size(frame)}: "
-                    "one array cannot "
-                    "hold both; in Python, fishd.recording.open_run(...).frames() gives them"
-                )
-            array[number] = frame.pixels
-        array.flush()
-        part.replace(path)
-    except OSError as error:
-        if isinstance(error, RecordingError):
-            raise
-        raise RecordingError(f"{path} cannot be written: {error.strerror or error}") from None
+        with os_errors(RecordingError, f"{path} cannot be written"):
+            _check_room(path, math.prod(shape))
+            array = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
+            for number, frame in enumerate(itertools.chain([first], frames)):
+                if frame.pixels.shape != first.pixels.shape:
+                    raise RecordingError(
+                        f"{run.path}: frames of {_format_size(first)} and of "
+                        f"{_format_size(frame)}: one array cannot hold both; in Python, "
+                        "fishd.recording.open_run(...).frames() gives them"
+                    )
+                array[number] = frame.pixels
+            array.flush()
+            part.replace(path)
     finally:
         part.unlink(missing_ok=True)
 

@@ -54,10 +54,8 @@ def runs_folder() -> Path:
 
 def ensure_folder(folder: Path) -> Path:
     """Create the folder if it does not exist, and return it; raise `RecordingError`."""
-    try:
+    with files.os_errors(RecordingError, f"{folder} cannot be created"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RecordingError(f"{folder} cannot be created: {error.strerror}") from None
     return folder
 
 

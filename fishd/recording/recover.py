@@ -6,6 +6,7 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from fishd.core.errors import RecordingError
+from fishd.core.files import os_errors
 from fishd.core.schema import json_schema, schema_name
 from fishd.core.tail_reading import RecordedTail
 from fishd.recording.images import IMAGE_SCHEMA, TAIL_TOPIC, image_json_schema
@@ -40,18 +41,15 @@ def recover(path: Path) -> Run:
     if not is_part and run.finished and run.is_as_recorded:
         raise RecordingError(f"{path} is finished and undamaged: there is nothing to recover")
     final = path.with_name(run.name + ("" if is_part else "-recovered") + SUFFIX)
-    try:
-        with lock_recording(path):
-            # Left by a kill.
-            final.with_name(final.name + RECOVERING_SUFFIX).unlink(missing_ok=True)
-            if is_part and run.finished and run.is_as_recorded and not final.exists():
-                rename_to_final(path, final)  # the recorder was killed just before
-            elif not (is_part and _is_copy(final, run)):
-                _write(run, final)
-            if is_part:
-                path.unlink(missing_ok=True)
-    except OSError as error:
-        raise RecordingError(f"{final} cannot be written: {error.strerror or error}") from None
+    with os_errors(RecordingError, f"{final} cannot be written"), lock_recording(path):
+        # Left by a kill.
+        final.with_name(final.name + RECOVERING_SUFFIX).unlink(missing_ok=True)
+        if is_part and run.finished and run.is_as_recorded and not final.exists():
+            rename_to_final(path, final)  # the recorder was killed just before
+        elif not (is_part and _is_copy(final, run)):
+            _write(run, final)
+        if is_part:
+            path.unlink(missing_ok=True)
     return open_run(final)
 
 

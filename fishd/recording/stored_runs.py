@@ -9,7 +9,7 @@ import time
 import zipfile
 from calendar import timegm
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import IO
 
@@ -18,8 +18,8 @@ from msgspec import Struct
 from fishd.core import files, text
 from fishd.core.errors import RecordingError
 from fishd.core.process.lockfile import find_lock_holder
-from fishd.recording.folder import EXPERIMENT, run_name
-from fishd.recording.notes import MAX_NOTE_CHARACTERS, note_path
+from fishd.recording.folder import EXPERIMENT, LATEST, run_name
+from fishd.recording.notes import MAX_NOTE_CHARACTERS, NOTE, note_path
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX, is_being_written, rename_to_final
 
 TRASH = ".trash"
@@ -28,7 +28,8 @@ KEPT_DAYS = 30
 """Time for which a deleted run stays in the trash [days]."""
 PACKED_SUFFIXES = (SUFFIX, ".png", ".parquet", ".onnx", ".zip")
 """Endings of files that are compressed already."""
-_NAME = re.compile(r"(?!.*\.part$)\w[\w. -]{0,99}")
+_NAME = re.compile(r"(?!latest$|.*\.(part|json|txt|lock|runner)$)\w[\w. -]{0,99}")
+"""Names of runs, which are neither another word for a run nor those of other files there."""
 _ID, _ID_FORMAT = re.compile(r"\d{8}-\d{6}(-\d+)?", re.A), "%Y%m%d-%H%M%S"
 _READ_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 
@@ -78,7 +79,8 @@ def rename_run(path: Path, name: str) -> Path:
     if not _NAME.fullmatch(name):
         raise RecordingError(
             f"'{text.quoted(name)}' cannot be a name: letters, digits, '_', '-', '.' and spaces, "
-            "at most 100, the first one a letter, a digit or '_'"
+            "at most 100, the first one a letter, a digit or '_'; neither "
+            f"'{LATEST}' nor a file's, such as queue.json"
         )
     _refuse_in_progress(path)
     target = path.with_name(name + path.name.removeprefix(old))
@@ -95,8 +97,11 @@ def delete_run(path: Path) -> DeletedRun:
         trash.mkdir(exist_ok=True)
         if trash.is_symlink():
             raise OSError(errno.ELOOP, "it is a symbolic link", str(trash))
-        place = files.unused_path(trash, time.strftime(_ID_FORMAT, time.gmtime()), "")
-        place.mkdir()
+        while True:
+            place = files.unused_path(trash, time.strftime(_ID_FORMAT, time.gmtime()), "")
+            with suppress(FileExistsError):  # another process deletes a run, too
+                place.mkdir()
+                break
     try:
         _move(path, place / path.name)
     except RecordingError:
@@ -111,7 +116,8 @@ def list_trash(folder: Path) -> list[DeletedRun]:
     """Return the deleted runs of a folder, the latest first; raise `RecordingError`."""
     deleted = []
     for place in sorted(_list_places(folder), reverse=True):
-        with _os_errors(place, "cannot be read"):
+        paths = list[Path]()
+        with _os_errors(place, "cannot be read"), suppress(FileNotFoundError):
             paths = sorted(place.iterdir())
         for path in paths:
             if path not in map(note_path, paths):
@@ -137,7 +143,7 @@ def empty_trash(folder: Path, days: float = 0.0) -> int:
     """Remove what has been in the trash for longer than this time; return the number of runs."""
     places = [p for p in _list_places(folder) if time.time() - _deletion_time(p) >= days * 86400]
     for place in places:
-        with _os_errors(place, "cannot be removed"):
+        with _os_errors(place, "cannot be removed"), suppress(FileNotFoundError):
             shutil.rmtree(place)
     return len(places)
 
@@ -178,7 +184,7 @@ def _pack_file(archive: zipfile.ZipFile, name: str, folder: int, place: str) -> 
         if not stat.S_ISREG(status.st_mode) or name.endswith(".lock"):
             return
         date = max(time.localtime(status.st_mtime)[:6], (1980, 1, 1, 0, 0, 0))
-        entry = zipfile.ZipInfo(f"{place}/{name}", date)
+        entry = zipfile.ZipInfo(f"{place}/{name}".encode(errors="replace").decode(), date)
         if not name.endswith(PACKED_SUFFIXES):
             entry.compress_type = zipfile.ZIP_DEFLATED
         with archive.open(entry, "w", force_zip64=True) as packed:
@@ -198,7 +204,7 @@ def _refuse_in_progress(path: Path) -> None:
 
 
 def _refuse_taken(folder: Path, name: str, remedy: str = "choose another name") -> None:
-    for suffix in ("", SUFFIX, SUFFIX + PART_SUFFIX):
+    for suffix in ("", SUFFIX, SUFFIX + PART_SUFFIX, f".{NOTE}"):  # a note of a run that is gone
         if os.path.lexists(folder / f"{name}{suffix}"):
             raise RecordingError(f"{folder / f'{name}{suffix}'} exists already; {remedy}")
 
@@ -231,12 +237,5 @@ def _deletion_time(place: Path) -> float:
         return 0.0
 
 
-@contextmanager
-def _os_errors(path: Path, problem: str) -> Iterator[None]:
-    """Raise `RecordingError` in place of an OSError."""
-    try:
-        yield
-    except OSError as error:
-        if isinstance(error, RecordingError):
-            raise
-        raise RecordingError(f"{path} {problem}: {error.strerror or error}") from None
+def _os_errors(path: Path, problem: str) -> AbstractContextManager[None]:
+    return files.os_errors(RecordingError, f"{path} {problem}")

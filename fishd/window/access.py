@@ -4,6 +4,8 @@ A request from the network needs a paired device; an emergency stop is open to e
 """
 
 import logging
+from collections.abc import Awaitable, Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Annotated, Any, NamedTuple, TypeVar
 
 from aiohttp import web
@@ -18,6 +20,8 @@ from fishd.window.web_server import check_body, host_name
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
+Waiting = Callable[[], AbstractContextManager[None]]
+"""Function that counts a request that may wait, and raises `Busy` for one too many."""
 
 COOKIE = "fishd_window"
 COOKIE_S = 365 * 86400
@@ -124,6 +128,43 @@ class AccessControl:
                 "pair it again with 'fishctl window pair --scope drive'",
             )
         return access
+
+    def get(
+        self,
+        path: str,
+        handle: Callable[[web.Request], Awaitable[Any]],
+        waiting: Waiting = nullcontext,
+    ) -> web.RouteDef:
+        """Return the route of a request for devices that may watch.
+
+        handle: returns the answer, or what is sent in it as JSON
+        """
+
+        async def serve(request: web.Request) -> web.StreamResponse:
+            request["access"] = self.require(request, "watch")
+            with waiting():
+                result = await handle(request)
+            return result if isinstance(result, web.StreamResponse) else success(result)
+
+        return web.get(path, serve)
+
+    def post(
+        self,
+        path: str,
+        handle: Callable[[web.Request, T], Awaitable[Any]],
+        kind: type[T],
+        scope: Scope = "drive",
+        waiting: Waiting = nullcontext,
+    ) -> web.RouteDef:
+        """Return the route of a request with a body of this kind, for devices of this scope."""
+
+        async def serve(request: web.Request) -> web.StreamResponse:
+            request["access"] = self.require(request, scope)
+            body = await read_body(request, kind)
+            with waiting():
+                return success(await handle(request, body))
+
+        return web.post(path, serve)
 
     def is_paired(self, request: web.Request) -> bool:
         """Return whether a request is from a paired device."""

@@ -102,6 +102,18 @@ async def answer_in_json(request: web.Request, handler: Handler) -> web.StreamRe
     return response
 
 
+_REFUSALS = (
+    (NoDaemon, 503, "no-daemon"),
+    ((Busy, DevicesBusy), 503, "busy"),
+    ((JobError, QueueError), 409, "job"),
+    (DeviceError, 403, "device"),
+    (ParameterError, 400, "bad-arguments"),
+    (FishError, 503, "no-daemon"),
+    (FishdError, 500, "failed"),
+)
+"""Status and code of each kind of error; the first one that fits counts."""
+
+
 def _refusal(error: FishdError) -> ApiError:
     """Return an error of fishd or of the window with its status."""
     message = text.error_message(error)
@@ -109,16 +121,5 @@ def _refusal(error: FishdError) -> ApiError:
         return error
     if isinstance(error, Refused):
         return ApiError(409, text.quoted(error.code), message)
-    if isinstance(error, NoDaemon):
-        return ApiError(503, "no-daemon", message)
-    if isinstance(error, Busy | DevicesBusy):
-        return ApiError(503, "busy", message)
-    if isinstance(error, JobError | QueueError):
-        return ApiError(409, "job", message)
-    if isinstance(error, DeviceError):
-        return ApiError(403, "device", message)
-    if isinstance(error, ParameterError):
-        return ApiError(400, "bad-arguments", message)
-    if isinstance(error, FishError):
-        return ApiError(503, "no-daemon", message)
-    return ApiError(500, "failed", message)
+    status, code = next(kind[1:] for kind in _REFUSALS if isinstance(error, kind[0]))
+    return ApiError(status, code, message)

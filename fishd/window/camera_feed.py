@@ -44,12 +44,8 @@ MAX_PICTURE_BYTES = 2**20
 """Largest picture that is sent to pages [bytes]."""
 
 
-class Picture(Struct, frozen=True):
-    """A JPEG picture for a page."""
-
-    header: str
-    """Crop, midline and fin angle, which the page draws into it, as JSON."""
-    jpeg: bytes
+Picture = tuple[str, bytes]
+"""Crop, midline and fin angle, which the page draws, as JSON; and the JPEG picture itself."""
 
 
 class CameraViewer(Viewer):
@@ -67,10 +63,10 @@ class CameraViewer(Viewer):
 
     def show(self, message: str | Picture) -> None:
         """Send facts, or a picture, next; it replaces one that still waits."""
-        if isinstance(message, Picture):
-            self._picture = message
-        else:
+        if isinstance(message, str):
             self._facts = message
+        else:
+            self._picture = message
         self.wake()
 
     def take(self) -> Iterable[str | bytes]:
@@ -78,7 +74,7 @@ class CameraViewer(Viewer):
         messages: list[str | bytes] = [self._facts] if self._facts else []
         self._facts = None
         if self._picture and self._has_drawn:
-            messages += self._picture.header, self._picture.jpeg
+            messages += self._picture
             self._picture, self._has_drawn = None, False
         return messages
 
@@ -224,7 +220,7 @@ def _make_picture(
         "uncertainty": tail and tail.uncertainty,
         "reason": tail.reason if tail else "",
     }
-    return Picture(encode_message("picture", encode(header)).decode(), view.jpeg)
+    return encode_message("picture", encode(header)).decode(), view.jpeg
 
 
 def _describe(client: "CameraClient", axis: "AxisWatch", tail: "TailWatch") -> str:

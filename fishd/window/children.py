@@ -3,33 +3,25 @@
 import asyncio
 import os
 import shlex
-from collections.abc import Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
 
 from fishd.core import text
+from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError
 from fishd.core.experiments import PROGRESS_VARIABLE
-from fishd.core.process.safe_path import python_command
+from fishd.core.process.fishctl_child import fishctl_command
 
-_CHILD = """\
-import ctypes, os, signal, sys
-ctypes.CDLL(None).prctl(1, int(signal.SIGTERM), 0, 0, 0)  # PR_SET_PDEATHSIG
-if os.getppid() != int(sys.argv.pop(1)):  # its parent was killed before
-    sys.exit(1)
-os.nice(5)
-from fishd.__main__ import fishctl
-fishctl()
-"""
+T = TypeVar("T")
+_decode: Callable[[bytes], Any] = decoder(Any)
 
 
 class JobError(FishdError):
     """A job cannot be started, or there is none."""
-
-
-def fishctl_command(words: Iterable[str]) -> list[str]:
-    """Return the command of a fishctl that ends with this process."""
-    return python_command("-c", _CHILD, str(os.getpid()), *words)
 
 
 async def spawn(words: list[str], runs: Path) -> asyncio.subprocess.Process:
@@ -55,10 +47,18 @@ async def call(words: list[str], runs: Path) -> bytes:
     try:
         output, errors = await process.communicate()
     finally:
-        if process.returncode is None:  # nobody waits for it any more
+        if process.returncode is None:  # the request has ended before
             with suppress(ProcessLookupError):
                 process.kill()
     if process.returncode and not output:
         message = text.line(errors.decode("utf-8", "replace")).removeprefix("fishctl: ")
         raise JobError(message or f"{shlex.join(words)} failed")
     return output
+
+
+async def call_json(words: list[str], runs: Path, decode: Callable[[bytes], T] = _decode) -> T:
+    """Return the JSON that fishctl prints, None if it prints nothing; raise `JobError`."""
+    try:
+        return decode(await call(words, runs) or b"null")
+    except msgspec.DecodeError as error:  # such as a part, if it was killed
+        raise JobError(f"'fishctl {words[0]}' answered: {text.error_message(error)}") from None

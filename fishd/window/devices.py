@@ -96,12 +96,9 @@ class Devices:
         """folder: is created if missing; raises `DeviceError`"""
         self._folder, self._path = folder, folder / "devices.json"
         self._copy = folder / "devices.copy.json"
-        try:
+        remedy = "set state in the settings"
+        with files.os_errors(DeviceError, f"{folder} cannot be created", remedy):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        except OSError as error:
-            raise DeviceError(
-                f"{folder} cannot be created: {error.strerror}; set state in the settings"
-            ) from None
         mode = stat.S_IMODE(folder.stat().st_mode)
         if mode & 0o022:
             raise DeviceError(

@@ -5,8 +5,6 @@ A browser that stops reading loses its download; few are sent at a time.
 
 import asyncio
 import os
-import shutil
-import tempfile
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
@@ -18,7 +16,8 @@ from aiohttp import web
 from fishd.core import text
 from fishd.core.errors import FishdError
 from fishd.core.files import FileProblem
-from fishd.window.children import JobError, call, spawn
+from fishd.window.children import JobError, spawn
+from fishd.window.exports import exported
 from fishd.window.fish_link import Busy
 from fishd.window.pictures import open_entry
 from fishd.window.web_server import finish
@@ -117,14 +116,9 @@ class Downloads:
         """Return a table of a recording, open, and removed already; raise `JobError`."""
         recording = await asyncio.to_thread(self._open_file, run, "recording.mcap")
         recording.close()
-        place = Path(await asyncio.to_thread(tempfile.mkdtemp, dir=self._scratch))
-        try:
-            form = f"--{file.rpartition('.')[2]}"
-            words = ["export", str(self._folder / run), form, f"--to={place}", "--json"]
-            await call(words, self._folder)
+        path, form = self._folder / run, file.rpartition(".")[2]
+        async with exported(path, form, self._scratch, self._folder) as place:
             return await asyncio.to_thread((place / _file_name(run, file)).open, "rb")
-        finally:
-            await asyncio.to_thread(shutil.rmtree, place, ignore_errors=True)
 
 
 def _file_name(run: str, file: str) -> str:

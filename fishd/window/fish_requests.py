@@ -12,8 +12,9 @@ from aiohttp import web
 from msgspec import Meta, Struct
 
 from fishd.core import text
-from fishd.window.access import AccessControl
-from fishd.window.answers import ApiError, NoArguments, convert, read_body, success
+from fishd.core.protocol import PolicyInfo
+from fishd.window.access import Access, AccessControl
+from fishd.window.answers import ApiError, NoArguments, convert, success
 from fishd.window.live import Driver
 from fishd.window.pages import Pages
 from fishd.window.web_server import ESTOP
@@ -72,26 +73,22 @@ class FishRequests:
     def __init__(self, access: AccessControl, pages: Pages) -> None:
         self._access, self._pages = access, pages
         self.routes = [
-            web.get("/api/fish", self._list_fish),
-            web.get("/api/fish/{fish}/policies", self._list_policies),
+            access.get("/api/fish", self._list_fish),
+            access.get("/api/fish/{fish}/policies", self._list_policies),
             web.post("/api/fish/{fish}/estop", self._estop, name=ESTOP),
-            web.post("/api/fish/{fish}/drive", self._drive),
-            web.post("/api/fish/{fish}/release", self._release),
-            web.post("/api/fish/{fish}/request", self._request),
+            access.post("/api/fish/{fish}/drive", self._drive, Drive),
+            access.post("/api/fish/{fish}/release", self._release, NoArguments),
+            access.post("/api/fish/{fish}/request", self._request, FishRequest),
         ]
 
-    async def _list_fish(self, request: web.Request) -> web.Response:
-        self._access.require(request, "watch")
-        return success(
-            [
-                {"name": link.name, "endpoint": link.address, "state": link.connection.state}
-                for link in self._pages.links.values()
-            ]
-        )
+    async def _list_fish(self, _: web.Request) -> list[dict[str, str]]:
+        return [
+            {"name": link.name, "endpoint": link.address, "state": link.connection.state}
+            for link in self._pages.links.values()
+        ]
 
-    async def _list_policies(self, request: web.Request) -> web.Response:
-        self._access.require(request, "watch")
-        return success(await self._pages.find_link(request.match_info["fish"]).list_policies())
+    async def _list_policies(self, request: web.Request) -> list[PolicyInfo]:
+        return await self._pages.find_link(request.match_info["fish"]).list_policies()
 
     async def _estop(self, request: web.Request) -> web.Response:
         access = self._access.require(request, "watch")
@@ -100,11 +97,9 @@ class FishRequests:
         log.warning("emergency stop of %s by %s: %s", link.name, access.name, result["outcome"])
         return success(result)
 
-    async def _drive(self, request: web.Request) -> web.Response:
-        access = self._access.require(request, "drive")
+    async def _drive(self, request: web.Request, body: Drive) -> dict[str, Any]:
         link = self._pages.find_link(request.match_info["fish"])
-        body = await read_body(request, Drive)
-        page = self._pages.find_page(request, access)
+        page = self._pages.find_page(request, request["access"])
         driver = self._pages.driver_of(link.name)
         if driver and driver.page is not page and not body.take:
             raise ApiError(
@@ -112,20 +107,17 @@ class FishRequests:
             )
         driver = Driver(page, body.keep)
         self._pages.set_driver(link.name, driver)
-        return success({"driver": driver.describe_to(page)})
+        return {"driver": driver.describe_to(page)}
 
-    async def _release(self, request: web.Request) -> web.Response:
-        access = self._access.require(request, "drive")
+    async def _release(self, request: web.Request, _: NoArguments) -> dict[str, None]:
         link = self._pages.find_link(request.match_info["fish"])
-        await read_body(request, NoArguments)
-        self._pages.require_driver(link.name, self._pages.find_page(request, access))
+        self._pages.require_driver(link.name, self._pages.find_page(request, request["access"]))
         await self._pages.end_driving(link.name, self._pages.driver_of(link.name))
-        return success({"driver": None})
+        return {"driver": None}
 
-    async def _request(self, request: web.Request) -> web.Response:
-        access = self._access.require(request, "drive")
+    async def _request(self, request: web.Request, body: FishRequest) -> dict[str, Any]:
+        access: Access = request["access"]
         link = self._pages.find_link(request.match_info["fish"])
-        body = await read_body(request, FishRequest)
         page = self._pages.find_page(request, access)
         kind = OPERATIONS.get(body.op)
         if kind is None:
@@ -140,4 +132,4 @@ class FishRequests:
         elif self._pages.driver_of(link.name) is None:
             self._pages.set_driver(link.name, Driver(page, False))
         holder = f"window: {access.name}"
-        return success(await link.request(body.op, arguments, holder, body.take, check))
+        return await link.request(body.op, arguments, holder, body.take, check)

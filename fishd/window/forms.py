@@ -5,13 +5,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
 from msgspec import Struct
 
-from fishd.core import text
 from fishd.core.decoding import decoder
 from fishd.core.experiments import Form, Plan
-from fishd.window.children import JobError, call
+from fishd.window.children import JobError, call_json
 from fishd.window.job_options import list_words, make_options, plan_without_verb
 
 PLAN_TIMEOUT_S = 60.0
@@ -40,12 +38,7 @@ class Forms:
         """Return the forms by their kinds; raise `JobError`."""
         async with self._reading:
             if not self._known:
-                try:
-                    forms = _decode_forms(await call(["window", "forms", "--json"], self._runs))
-                except msgspec.DecodeError as error:
-                    raise JobError(
-                        f"the forms cannot be read: {text.error_message(error)}"
-                    ) from None
+                forms = await call_json(["window", "forms", "--json"], self._runs, _decode_forms)
                 self._known = {form.kind: KnownForm(form, make_options(form)) for form in forms}
         return self._known
 
@@ -63,8 +56,6 @@ class Forms:
         words = [*list_words(form, options), *fish, "--dry-run", "--json"]
         try:
             async with self._planning, asyncio.timeout(PLAN_TIMEOUT_S):
-                return _decode_plan(await call(words, self._runs))
+                return await call_json(words, self._runs, _decode_plan)
         except TimeoutError:
             raise JobError(f"'fishctl {form.kind}' has not answered") from None
-        except msgspec.DecodeError as error:
-            raise JobError(f"'fishctl {form.kind}' answered: {text.error_message(error)}") from None

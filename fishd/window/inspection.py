@@ -11,7 +11,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import msgspec
 from aiohttp import web
 
 from fishd import __version__
@@ -20,8 +19,8 @@ from fishd.core.addresses import SERVICE_SOCKET
 from fishd.core.clock import read_boot_id
 from fishd.core.errors import FishError
 from fishd.window.access import AccessControl
-from fishd.window.answers import ApiError, NoArguments, read_body, success
-from fishd.window.children import JobError, call
+from fishd.window.answers import ApiError, NoArguments
+from fishd.window.children import JobError, call_json
 from fishd.window.fish_link import FishLink
 from fishd.window.metrics import measure_disk
 from fishd.window.pages import Pages
@@ -55,7 +54,7 @@ class InspectionRequests:
         cameras: Mapping[str, str | None],
     ) -> None:
         """cameras: address of the requests of the camera above each fish, by its name"""
-        self._access, self._pages, self._runs, self._cameras = access, pages, runs, cameras
+        self._pages, self._runs, self._cameras = pages, runs, cameras
         self._answers: dict[tuple[str, str], asyncio.Task[Any]] = {}
         """Latest answer about each fish and part; it may still be awaited."""
         self._defaults: Row = {}
@@ -67,33 +66,30 @@ class InspectionRequests:
             "log": _read_log,
         }
         self.routes = [
-            web.get("/api/fish/{fish}/about/{part}", self._get_part),
-            web.post("/api/fish/{fish}/doctor", self._examine),
+            access.get("/api/fish/{fish}/about/{part}", self._get_part),
+            access.post("/api/fish/{fish}/doctor", self._examine, NoArguments, scope="watch"),
         ]
 
-    async def _get_part(self, request: web.Request) -> web.Response:
-        self._access.require(request, "watch")
+    async def _get_part(self, request: web.Request) -> Any:
         link, part = self._pages.find_link(request.match_info["fish"]), request.match_info["part"]
         if part not in self._parts:
             known = ", ".join(self._parts)
             raise ApiError(404, "no-part", f"no such part '{text.quoted(part)}'; here: {known}")
         return await self._answer(link, part, self._parts[part])
 
-    async def _examine(self, request: web.Request) -> web.Response:
-        self._access.require(request, "watch")
+    async def _examine(self, request: web.Request, _: NoArguments) -> Any:
         link = self._pages.find_link(request.match_info["fish"])
-        await read_body(request, NoArguments)
         return await self._answer(link, "doctor", self._run_doctor)
 
     async def _answer(
         self, link: FishLink, part: str, read: Callable[[FishLink], Coroutine[Any, Any, Any]]
-    ) -> web.Response:
-        """Answer with what `read` returns, which runs once at a time; raise `ApiError`."""
+    ) -> Any:
+        """Return what `read` returns, which runs once at a time; raise `ApiError`."""
         task = self._answers.get((link.name, part))
         if task is None or task.done():
             task = self._answers[link.name, part] = asyncio.create_task(read(link))
         try:
-            return success(await asyncio.wait_for(asyncio.shield(task), ANSWER_TIMEOUT_S))
+            return await asyncio.wait_for(asyncio.shield(task), ANSWER_TIMEOUT_S)
         except TimeoutError:
             message = f"{part}: no answer within {ANSWER_TIMEOUT_S:g} s; try again later"
             raise ApiError(503, "busy", message) from None
@@ -101,7 +97,7 @@ class InspectionRequests:
     async def _run_doctor(self, link: FishLink) -> Any:
         """Return the results of `fishctl doctor --json`; raise `JobError`."""
         words = ["doctor", "--json", *link.endpoint_options]
-        return msgspec.json.decode(await call(words, self._runs.folder))
+        return await call_json(words, self._runs.folder)
 
     async def _read_disk(self, link: FishLink) -> Row:
         """Return the free space for recordings [bytes], and the bytes of an hour."""
@@ -122,8 +118,8 @@ class InspectionRequests:
     async def _read_settings(self, link: FishLink) -> Row:
         """Return the keys of the configuration, and the calibrations; raise `FishdError`."""
         if not self._defaults:
-            output = await call(["config", "show", "--json"], self._runs.folder)
-            self._defaults = dict(_flatten(msgspec.json.decode(output)))
+            words = ["config", "show", "--json"]
+            self._defaults = dict(_flatten(await call_json(words, self._runs.folder)))
         settings, calibrations = await link.read_settings()
         missing = object()
         keys = [

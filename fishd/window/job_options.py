@@ -20,7 +20,7 @@ Name = Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*\Z", max_length=60)
 Contestant = Annotated[
     str, Meta(pattern=r"^[A-Za-z0-9_.~/][A-Za-z0-9_.:,+=~/-]*\Z", max_length=200)
 ]
-RunName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_. -]*\Z", max_length=100)]
+RunName = Annotated[str, Meta(pattern=r"^\w[\w. -]*\Z", max_length=100)]
 Line = Annotated[str, Meta(pattern=PRINTABLE, max_length=500)]
 Word = Annotated[str, Meta(pattern=r"^(-?[0-9.:]|[A-Za-z_])[A-Za-z0-9_.:,+=-]*\Z", max_length=200)]
 Value = bool | int | float | Line | None

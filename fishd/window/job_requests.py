@@ -11,8 +11,8 @@ from msgspec import Struct
 from fishd.core import text
 from fishd.core.errors import ParameterError
 from fishd.core.experiments import Form, Plan
-from fishd.window.access import AccessControl
-from fishd.window.answers import ApiError, NoArguments, convert, read_body, success
+from fishd.window.access import Access, AccessControl
+from fishd.window.answers import ApiError, NoArguments, convert
 from fishd.window.children import JobError
 from fishd.window.fish_link import Busy, FishLink
 from fishd.window.job_options import (
@@ -23,7 +23,7 @@ from fishd.window.job_options import (
     list_words,
     swims,
 )
-from fishd.window.jobs import Jobs
+from fishd.window.jobs import Job, Jobs
 from fishd.window.pages import Pages
 from fishd.window.run_requests import RunRequests
 
@@ -57,14 +57,14 @@ class JobRequests:
         self.folder = jobs.runs.folder
         """Folder of recordings and experiments."""
         self.routes = [
-            web.get("/api/forms", self._list_forms),
-            web.get("/api/jobs", self._list_jobs),
-            web.post("/api/jobs", self._start_job),
-            web.post("/api/jobs/check", self._check_job),
-            web.post("/api/jobs/{job}/stop", self._stop_job),
-            web.post("/api/jobs/{job}/dismiss", self._dismiss_job),
-            web.get("/api/runs", self._list_runs),
-            web.get("/api/runs/{run}/plot.png", self._plot_run),
+            access.get("/api/forms", self._list_forms),
+            access.get("/api/jobs", self._list_jobs),
+            access.post("/api/jobs", self._start_job, JobRequest),
+            access.post("/api/jobs/check", self._check_job, JobRequest, scope="watch"),
+            access.post("/api/jobs/{job}/stop", self._stop_job, NoArguments),
+            access.post("/api/jobs/{job}/dismiss", self._dismiss_job, NoArguments),
+            access.get("/api/runs", lambda _: jobs.runs.list_all(), self.waiting_for_disk),
+            access.get("/api/runs/{run}/plot.png", self._plot_run, self.waiting_for_disk),
             *RunRequests(access, jobs.runs, self.waiting_for_disk).routes,
         ]
 
@@ -79,17 +79,11 @@ class JobRequests:
         finally:
             self._waiting -= 1
 
-    async def _list_jobs(self, request: web.Request) -> web.Response:
-        self._access.require(request, "watch")
-        return success(self._jobs.all())
+    async def _list_jobs(self, _: web.Request) -> list[Job]:
+        return self._jobs.all()
 
-    async def _list_forms(self, request: web.Request) -> web.Response:
-        self._access.require(request, "watch")
-        return success([form for form, _ in (await self._jobs.forms.all()).values()])
-
-    async def _read_job(self, request: web.Request) -> WantedJob:
-        """Return the job that a page wants; raise `ApiError` and `JobError`."""
-        return await self.check_job(await read_body(request, JobRequest))
+    async def _list_forms(self, _: web.Request) -> list[Form]:
+        return [form for form, _ in (await self._jobs.forms.all()).values()]
 
     async def check_job(self, body: JobRequest) -> WantedJob:
         """Return a job with checked options; raise `ApiError` and `JobError`."""
@@ -121,22 +115,19 @@ class JobRequests:
         except JobError as error:
             raise ApiError(400, "bad-arguments", str(error)) from None
 
-    async def _check_job(self, request: web.Request) -> web.Response:
-        """Answer with the command line of a job, its plan, and what is wrong with it."""
-        access = self._access.require(request, "watch")
-        plan = None
+    async def _check_job(self, request: web.Request, body: JobRequest) -> dict[str, Any]:
+        """Return the command line of a job, its plan, and what is wrong with it."""
         try:
-            job = await self._read_job(request)
-            if access.scope == "drive":
-                plan = await self._plan(job)
+            job = await self.check_job(body)
+            plan = await self._plan(job) if request["access"].scope == "drive" else None
         except (ApiError, JobError, ParameterError) as error:
-            return success({"command": [], "problem": str(error), "plan": None})
+            return {"command": [], "problem": str(error), "plan": None}
         words = list_words(job.form, job.options) if job.form else ["resume"]
-        return success({"command": ["fishctl", *words], "problem": "", "plan": plan})
+        return {"command": ["fishctl", *words], "problem": "", "plan": plan}
 
-    async def _start_job(self, request: web.Request) -> web.Response:
-        access = self._access.require(request, "drive")
-        form, link, options = wanted = await self._read_job(request)
+    async def _start_job(self, request: web.Request, body: JobRequest) -> Job:
+        access: Access = request["access"]
+        form, link, options = wanted = await self.check_job(body)
         page = self._pages.find_page(request, access)
         with self.waiting_for_disk():
             drives = await self._drives(wanted)
@@ -155,7 +146,7 @@ class JobRequests:
         with self.waiting_for_disk():
             job = await self._jobs.start(form, link.name, endpoint, options, device, check, plan)
         self._pages.tell_job(job)
-        return success(job)
+        return job
 
     async def _drives(self, job: WantedJob) -> bool:
         """Return whether a job swims the live fish."""
@@ -166,25 +157,14 @@ class JobRequests:
         header = await asyncio.to_thread(self._jobs.runs.read_header, job.options.run)
         return header is None or header.on == "live"
 
-    async def _stop_job(self, request: web.Request) -> web.Response:
-        self._access.require(request, "drive")
-        await read_body(request, NoArguments)
-        return success(self._jobs.stop(request.match_info["job"]))
+    async def _stop_job(self, request: web.Request, _: NoArguments) -> Job:
+        return self._jobs.stop(request.match_info["job"])
 
-    async def _dismiss_job(self, request: web.Request) -> web.Response:
-        self._access.require(request, "drive")
-        await read_body(request, NoArguments)
+    async def _dismiss_job(self, request: web.Request, _: NoArguments) -> Job:
         job = self._jobs.dismiss(request.match_info["job"])
         self._pages.tell_job(job)
-        return success(job)
-
-    async def _list_runs(self, request: web.Request) -> web.Response:
-        self._access.require(request, "watch")
-        with self.waiting_for_disk():
-            return success(await self._jobs.runs.list_all())
+        return job
 
     async def _plot_run(self, request: web.Request) -> web.Response:
-        self._access.require(request, "watch")
-        with self.waiting_for_disk():
-            picture = await self._jobs.runs.plot(request.match_info["run"])
+        picture = await self._jobs.runs.plot(request.match_info["run"])
         return web.Response(body=picture, content_type="image/png")

@@ -1,7 +1,7 @@
 """Experiments of the page: the verbs of fishctl as child processes, with progress and stop.
 
-A child ends with this process, and an experiment returns the fish at its end. What was lost with a
-window that was killed is among the jobs of its successor.
+A child ends with this process, and an experiment returns the fish at its end. One that ended with a
+window that was killed is among the runs, unfinished, and can be resumed there.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ from fishd.core.experiments import (
     Progress,
 )
 from fishd.window.children import JobError, spawn
-from fishd.window.curves import read_curve
+from fishd.window.exports import read_curve
 from fishd.window.forms import Forms
 from fishd.window.job_options import ResumeOptions, list_words, swims
 from fishd.window.runs import Runs
@@ -58,8 +58,8 @@ class Job(Struct):
     fish: str
     command: list[str]
     """Words that a person would type."""
-    state: Literal["running", "done", "failed", "stopped", "lost", "dismissed"]
-    """`lost`: its window was killed; `dismissed`: it is no longer listed."""
+    state: Literal["running", "done", "failed", "stopped", "dismissed"]
+    """`dismissed`: it is no longer listed."""
     elapsed: float
     """Time since its start, until its end at most [s]."""
     run: str = ""
@@ -81,7 +81,6 @@ class _Report(Struct):
     progress: Progress
 
 
-_decode_job: Callable[[bytes], Job] = decoder(Job)
 _decode_report: Callable[[bytes], _Report] = decoder(_Report)
 
 
@@ -93,17 +92,15 @@ class Jobs:
         runs: Path,
         scratch: Path,
         tell: Callable[[Job], None],
-        keep: Callable[[list[Job]], object],
         show_folder: bool = False,
     ) -> None:
         """
         runs: folder of recordings and experiments
         scratch: folder for what jobs leave for this window only
         tell: receives a job that has changed
-        keep: receives the jobs that run, where one begins or ends
         show_folder: whether the commands that pages show name the folder
         """
-        self._tell_pages, self._keep, self._show_folder = tell, keep, show_folder
+        self._tell_pages, self._show_folder = tell, show_folder
         self._jobs: dict[str, Job] = {}
         self._starts: dict[str, float] = {}
         """Start of each job that runs [s, monotonic]."""
@@ -138,29 +135,6 @@ class Jobs:
     def _tell(self, job: Job) -> None:
         self._tell_pages(self._with_elapsed_time(job))
 
-    def take_lost(self, lost: Iterable[msgspec.Raw]) -> None:
-        """List the jobs of a window that was killed, each with what is left of it."""
-        for payload in lost:
-            with suppress(msgspec.DecodeError):
-                job = _decode_job(payload)
-                job.id, job.state = self._new_id(), "lost"
-                job.lines = [self._describe_remains(job)]
-                self._jobs[job.id] = job
-
-    def _describe_remains(self, job: Job) -> str:
-        """Return what is left of a job that was lost; mark it done or resumable if it is."""
-        what = "fishd-window was killed while this ran"
-        if job.run:
-            if self._conclude(job):
-                job.state = "done"
-                return "fishd-window was killed, but this was complete"
-            rests = f"{what}, and the fish came to rest"
-            kept = f"what was measured until then is in {job.run}"
-            return f"{rests}; {kept if job.resumable else 'nothing was measured yet'}"
-        if job.kind == "record":
-            return f"{what}; what was recorded until then is among the runs"
-        return f"{what}; start it again"
-
     def _conclude(self, job: Job) -> bool:
         """Return whether an experiment that has ended is complete; else it can be resumed.
 
@@ -168,13 +142,7 @@ class Jobs:
         """
         header = self.runs.read_header(job.run) if job.run else None
         job.resumable = header is not None and not header.ended and job.exit != 0
-        if header is None or not header.ended:
-            return job.exit == 0
-        if job.state == "lost":
-            with suppress(files.FileProblem, msgspec.DecodeError):
-                path = self._folder / job.run / "result.json"
-                job.result = decoder(Any)(files.read(path, MAX_OUTPUT_BYTES, "a result"))
-        return True
+        return job.exit == 0 or bool(header and header.ended)
 
     def _new_id(self) -> str:
         self._count += 1
@@ -210,10 +178,8 @@ class Jobs:
         self, form: Form | None, options: Any, fish: str, endpoint: list[str]
     ) -> tuple[Job, list[str]]:
         """Return a job whose folders exist then, and the arguments of fishctl."""
-        try:
+        with files.os_errors(JobError, f"{self._folder} cannot be created"):
             self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise JobError(f"{self._folder} cannot be created: {error.strerror}") from None
         if form is None:
             return self._resume(options, fish, endpoint)
         kind = form.kind
@@ -241,7 +207,6 @@ class Jobs:
             if ended is None:
                 break
             del self._jobs[ended]
-        self._keep_running()
         self._owners[name] = device
         self._tasks[name] = asyncio.create_task(self._run(job, words))
         return job
@@ -277,9 +242,6 @@ class Jobs:
     def _recording_of(self, job: Job) -> Path:
         """Return the path of the recording of a simulated fish."""
         return self._scratch / f"simulate-{job.id}.mcap"
-
-    def _keep_running(self) -> None:
-        self._keep([job for job in self._jobs.values() if job.state == "running"])
 
     def stop(self, name: str) -> Job:
         """Interrupt a job as Ctrl-C does: an experiment lets the fish rest first."""
@@ -338,7 +300,6 @@ class Jobs:
             self._owners.pop(job.id, None)
             self._stopping.discard(job.id)
             self.runs.forget()
-            self._keep_running()
             self._tell(job)
 
     async def _run_child(self, job: Job, words: list[str]) -> bytes:

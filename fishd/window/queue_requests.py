@@ -10,7 +10,7 @@ from msgspec import Meta, Struct
 from fishd.core import text
 from fishd.core.experiment_queue import MAX_ITEMS, QueueFile, Repeat, View
 from fishd.window.access import AccessControl
-from fishd.window.answers import ApiError, read_body, success
+from fishd.window.answers import ApiError
 from fishd.window.children import call
 from fishd.window.fish_link import FishLink
 from fishd.window.job_options import QUEUE, list_words, swims
@@ -59,33 +59,29 @@ class QueueRequests:
         self._access, self._pages, self._jobs = access, pages, jobs
         self._adding = asyncio.Lock()
         self.routes = [
-            web.get("/api/fish/{fish}/queue", self._show),
-            web.post("/api/fish/{fish}/queue", self._change),
+            access.get("/api/fish/{fish}/queue", self._show, jobs.waiting_for_disk),
+            access.post(
+                "/api/fish/{fish}/queue", self._change, QueueChange, waiting=jobs.waiting_for_disk
+            ),
         ]
 
-    async def _show(self, request: web.Request) -> web.Response:
-        self._access.require(request, "watch")
+    async def _show(self, request: web.Request) -> View:
         link = self._pages.find_link(request.match_info["fish"])
-        with self._jobs.waiting_for_disk():
-            return success(await asyncio.to_thread(self._view, link))
+        return await asyncio.to_thread(self._view, link)
 
-    async def _change(self, request: web.Request) -> web.Response:
-        self._access.require(request, "drive")
+    async def _change(self, request: web.Request, change: QueueChange) -> View:
         link = self._pages.find_link(request.match_info["fish"])
-        change = await read_body(request, QueueChange)
-        with self._jobs.waiting_for_disk():
-            if change.op == "add":
-                words = await self._list_words(link, change)
-                async with self._adding:  # one process at a time
-                    self._access.require(request, "drive")
-                    await call(words, self._jobs.folder)
-                return success(await asyncio.to_thread(self._view, link))
-            return success(await asyncio.to_thread(self._view, link, change))
+        if change.op == "add":
+            words = await self._list_words(link, change)
+            async with self._adding:  # one process at a time
+                self._access.require(request, "drive")
+                await call(words, self._jobs.folder)
+        return await asyncio.to_thread(self._view, link, change)
 
     def _view(self, link: FishLink, change: QueueChange | None = None) -> View:
         """Return the queue of a fish, after a change if there is one; raise `QueueError`."""
         file = QueueFile(self._jobs.folder, link.endpoint)
-        if change:
+        if change and change.op != "add":
             change.apply(file)
         return file.view()
 

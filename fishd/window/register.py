@@ -1,17 +1,15 @@
-"""The windows that run, and the jobs of those that were killed.
+"""The windows that run.
 
 Each window has a file in its state folder, which is locked while the window lives. By it, `fishctl
-window` finds the window, and a later window learns which experiments were lost with an earlier one.
+window` finds the window.
 """
 
 import shutil
+import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
 from os import getpid
 from pathlib import Path
-from types import TracebackType
-from typing import Any
 
 import msgspec
 from msgspec import Struct
@@ -36,8 +34,6 @@ class RunningWindow(Struct, frozen=True):
     """Address at which it listens, such as `0.0.0.0:8880`."""
     names: tuple[str, ...] = ()
     """Further host names by which browsers reach it."""
-    jobs: list[msgspec.Raw] = []
-    """Jobs of the window that run, as JSON."""
 
 
 _decode: Callable[[bytes], RunningWindow] = decoder(RunningWindow)
@@ -52,7 +48,6 @@ class Register:
         self.scratch = self._path.with_suffix(_SCRATCH_SUFFIX)
         """Folder that is removed at the end, or with the next window if this one is killed."""
         self._stack = ExitStack()
-        self._entry = RunningWindow("")
 
     def __enter__(self) -> "Register":
         try:
@@ -62,27 +57,18 @@ class Register:
             raise StartupError(f"{lock_path(self._path)} cannot be locked: {error}") from None
         self._stack.callback(self._path.unlink, missing_ok=True)
         self._stack.callback(shutil.rmtree, self.scratch, ignore_errors=True)
-        # A disk may be slow, and an emergency stop must not wait for it.
-        self._disk = ThreadPoolExecutor(1, thread_name_prefix="register")
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        wait([self._disk.submit(self._stack.close)], CLOSE_TIMEOUT_S)
-        self._disk.shutdown(wait=False)
+    def __exit__(self, *_: object) -> None:
+        # A disk may be slow: a later window removes what stays.
+        closing = threading.Thread(target=self._stack.close, daemon=True)
+        closing.start()
+        closing.join(CLOSE_TIMEOUT_S)
 
-    def change(self, **fields: Any) -> Future[None]:
-        """Change fields of the entry soon; a full disk keeps the earlier entry."""
-        self._entry = msgspec.structs.replace(self._entry, **fields)
-        return self._disk.submit(self._write, msgspec.json.encode(self._entry))
-
-    def _write(self, content: bytes) -> None:
+    def write(self, entry: RunningWindow) -> None:
+        """Write the entry; on a full disk, there is none."""
         with suppress(OSError):
-            write_atomically(self._path, content)
+            write_atomically(self._path, msgspec.json.encode(entry))
 
 
 def find_running(folder: Path) -> list[RunningWindow]:
@@ -91,18 +77,15 @@ def find_running(folder: Path) -> list[RunningWindow]:
     return sorted(running, key=lambda entry: WindowSettings(listen=entry.listen).is_local)
 
 
-def take_lost_jobs(folder: Path) -> list[msgspec.Raw]:
-    """Return the jobs of the windows that were killed, and remove their entries and folders."""
-    jobs = list[msgspec.Raw]()
+def remove_killed(folder: Path) -> None:
+    """Remove the entries and folders of the windows that were killed."""
     for scratch in folder.glob(f"window-*{_SCRATCH_SUFFIX}"):
         if not find_lock_holder(scratch.with_suffix(".json")):
             shutil.rmtree(scratch, ignore_errors=True)
-    for path, entry in _read_entries(folder):
+    for path, _ in _read_entries(folder):
         if not find_lock_holder(path):
-            jobs += entry.jobs
             path.unlink(missing_ok=True)
             lock_path(path).unlink(missing_ok=True)
-    return jobs
 
 
 def _read_entries(folder: Path) -> Iterator[tuple[Path, RunningWindow]]:

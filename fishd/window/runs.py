@@ -14,7 +14,7 @@ from msgspec import Struct
 
 from fishd.core import files, text
 from fishd.core.decoding import decoder
-from fishd.window.children import JobError, call
+from fishd.window.children import JobError, call, call_json
 from fishd.window.pictures import open_picture, open_run_picture
 
 RUNS_AGE_S = 1.0
@@ -67,16 +67,10 @@ class Runs:
                 # A disk may stall, and an emergency stop must not wait for it.
                 is_empty = await asyncio.to_thread(_is_empty, self.folder)
                 # An empty folder saves a process for each page of a new window.
-                runs = [] if is_empty else await self._list_folder()
+                words = ["runs", f"--folder={self.folder}", "--json"]
+                runs = [] if is_empty else await call_json(words, self.folder)
                 self._list = (time.monotonic(), runs)
             return runs
-
-    async def _list_folder(self) -> Any:
-        output = await call(["runs", f"--folder={self.folder}", "--json"], self.folder)
-        try:
-            return msgspec.json.decode(output)
-        except msgspec.DecodeError:
-            raise JobError(f"the runs in {self.folder} could not be listed") from None
 
     async def plot(self, name: str) -> BinaryIO:
         """Return the picture of a run, open; draw it if it has none; raise `JobError`."""
@@ -89,16 +83,16 @@ class Runs:
         except files.FileProblem as problem:
             raise JobError(str(problem)) from None
 
-    async def call_json(self, verb: str, *names: str) -> Any:
+    async def call_verb(self, verb: str, *names: str) -> Any:
         """Return what a verb of `fishctl runs` prints as JSON, one at a time; raise `JobError`."""
         words = ["runs", verb, f"--folder={self.folder}", "--json", "--", *names]
         async with self._calling:
-            return msgspec.json.decode(await call(words, self.folder) or b"null")
+            return await call_json(words, self.folder)
 
     async def change(self, verb: str, *words: str) -> Any:
         """Return what a verb of `fishctl runs` prints that changes runs; raise `JobError`."""
         try:
-            return await self.call_json(verb, *words)
+            return await self.call_verb(verb, *words)
         finally:
             self.forget()
 

@@ -76,7 +76,6 @@ class WebServer:
         readers: Mapping[str, Set[str]] | None = None,
         is_paired: Callable[[web.Request], bool] = lambda request: False,
         max_body_bytes: int = 1024,
-        advice: str = "name another port with --port",
     ) -> None:
         """
         host: address to listen at; port: 0 for any free port
@@ -84,9 +83,8 @@ class WebServer:
         middlewares: those of aiohttp that get what the guards refuse, too
         readers: origins of other pages that may open a WebSocket, by its path
         is_paired: returns whether a request is from a paired device
-        advice: remedy where the port cannot be taken
         """
-        self._host, self._port, self._advice = host, port, advice
+        self._host, self._port = host, port
         self._readers = readers or {}
         self.viewers: set[Viewer] = set()
         """Open WebSockets."""
@@ -131,7 +129,8 @@ class WebServer:
             number = error.errno or 0  # negative for errors of the resolver
             reason = os.strerror(number) if number > 0 else error.strerror or error
             raise StartupError(
-                f"cannot serve a page at {self._host}:{self._port}: {reason}; {self._advice}"
+                f"cannot serve a page at {self._host}:{self._port}: {reason}; name another one "
+                "with --listen"
             ) from None
         return self
 

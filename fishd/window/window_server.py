@@ -8,7 +8,6 @@ from typing import Self
 from urllib.parse import urlsplit
 
 from aiohttp import web
-from msgspec import Raw
 
 from fishd.core import text
 from fishd.window.access import AccessControl
@@ -19,12 +18,11 @@ from fishd.window.foxglove import PROTOCOLS
 from fishd.window.inspection import InspectionRequests
 from fishd.window.job_requests import JobRequests
 from fishd.window.jobs import Jobs
-from fishd.window.live import encode
 from fishd.window.metrics import MetricsRequests
 from fishd.window.pages import Pages
 from fishd.window.paired_devices import PairedDevices
 from fishd.window.queue_requests import QueueRequests
-from fishd.window.register import Register, take_lost_jobs
+from fishd.window.register import Register, RunningWindow, remove_killed
 from fishd.window.settings import WindowSettings
 from fishd.window.web_server import WebServer, file_routes
 
@@ -45,7 +43,6 @@ class WindowServer(WebServer):
             settings.runs_folder,
             self._register.scratch,
             tell=lambda job: self._pages.tell_job(job),
-            keep=lambda jobs: self._register.change(jobs=[Raw(encode(job)) for job in jobs]),
             show_folder=settings.runs is not None,
         )
         self._pages = Pages(
@@ -84,7 +81,6 @@ class WindowServer(WebServer):
             readers={"/foxglove": frozenset(settings.origins)},
             is_paired=access.is_paired,
             max_body_bytes=MAX_BODY_BYTES,
-            advice="name another one with --listen",
         )
 
     async def __aenter__(self) -> Self:
@@ -92,11 +88,11 @@ class WindowServer(WebServer):
         async with AsyncExitStack() as stack:
             stack.enter_context(self._register)
             await super().__aenter__()
-            self._jobs.take_lost(take_lost_jobs(self._settings.state_folder))
+            remove_killed(self._settings.state_folder)
             host = self._settings.listen.rpartition(":")[0]
             listen = f"{host}:{urlsplit(self.url).port}"
-            entry = self._register.change(listen=listen, names=self._settings.names)
-            await asyncio.wrap_future(entry)
+            entry = RunningWindow(listen, self._settings.names)
+            await asyncio.to_thread(self._register.write, entry)
             self._run = asyncio.create_task(self._pages.run())
             self._run.add_done_callback(_log_failure)
             self._stack = stack.pop_all()

@@ -25,7 +25,11 @@ class CameraProcess(Process):
         """pairs: settings, KEY=VALUE"""
         self.endpoint = f"ipc://{folder}/camera-requests"
         self.frames = f"ipc://{folder}/camera-frames"
-        own = (f"publish.requests={self.endpoint}", f"publish.frames={self.frames}")
+        own = (
+            f"publish.requests={self.endpoint}",
+            f"publish.frames={self.frames}",
+            f"tail.learned={folder}/tail.bin",
+        )
         super().__init__(*(command or COMMAND), *sets(*own, *pairs))
 
     def client(self, **options: Any) -> CameraClient:

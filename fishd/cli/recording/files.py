@@ -28,9 +28,17 @@ from fishd.recording.folder import (
 from fishd.recording.part_file import SUFFIX
 from fishd.recording.reader import RECOVERED
 
+
+def _choose_folder(context: click.Context, _: click.Parameter, folder: Path | None) -> Path:
+    """Return the folder of runs: of this verb, else of `fishctl runs --folder`."""
+    given = context.parent.params.get("folder") if context.parent else None
+    return folder or given or runs_folder()
+
+
 folder_option = click.option(
     "--folder",
     type=click.Path(path_type=Path, file_okay=False),
+    callback=_choose_folder,
     help="Folder with recordings, such as that of an experiment; default: "
     f"${FOLDER_VARIABLE}, else runs in the current folder.",
 )
@@ -96,7 +104,7 @@ def export(
     form: str | None,
     target: Path | None,
     force: bool,
-    folder: Path | None,
+    folder: Path,
     as_json: bool,
 ) -> None:
     """Write a recording as tables: one row a tick, and a second file with its events.
@@ -129,7 +137,7 @@ def plot(
     end: float | None,
     target: Path | None,
     force: bool,
-    folder: Path | None,
+    folder: Path,
     as_json: bool,
 ) -> None:
     """Draw forces, command, thrust, the controller's own quantities, and a phase portrait.
@@ -140,7 +148,7 @@ def plot(
     recording is left out.
     """
     from fishd.lab.run_figure import draw_run, draw_runs
-    from fishd.lab.run_traces import traces
+    from fishd.lab.run_traces import Traces, traces
 
     experiments = [_find_experiment(run, folder) for run in runs]
     if any(experiments) and (begin or end is not None):
@@ -150,26 +158,24 @@ def plot(
         _draw_experiment(experiment, path)
         print_paths([path], as_json)
         return
-    pairs = list(zip(runs, experiments, strict=True))
-    recordings = {
-        experiment.name if experiment else run: _open_plotted(run, experiment, folder)
-        for run, experiment in pairs
-    }
-    left_out = [name for name, recording in recordings.items() if recording is None]
-    kept = {name: recording for name, recording in recordings.items() if recording}
-    if not kept:
+    drawn: list[tuple[str, Traces]] = []
+    left_out, first = list[str](), None
+    for run, experiment in zip(runs, experiments, strict=True):
+        name = experiment.name if experiment else run.rpartition("/")[2].removesuffix(SUFFIX)
+        if recording := _open_plotted(run, experiment, folder):
+            first = first or recording
+            drawn.append((name, traces(recording, begin, math.inf if end is None else end)))
+        else:
+            left_out.append(name)
+    if first is None:
         raise FishdError(f"nothing can be drawn: no recording in {', '.join(left_out)}")
-    last = math.inf if end is None else end
-    drawn = {name: traces(recording, begin, last) for name, recording in kept.items()}
-    first = next(iter(kept.values()))
-    name = first.name if len(runs) == 1 else f"{first.name}-compared"
+    is_single = len(runs) == 1
+    name = first.name if is_single else f"{first.name}-compared"
     path = _picture_path(target or first.path.parent, name, force)
-    if len(runs) == 1:
-        draw_run(drawn[runs[0]], path)
+    if is_single:
+        draw_run(drawn[0][1], path)
     else:
-        draw_runs(
-            {n.rpartition("/")[2].removesuffix(SUFFIX): t for n, t in drawn.items()}, left_out, path
-        )
+        draw_runs(drawn, left_out, path)
     print_paths([path], as_json)
 
 
@@ -180,13 +186,13 @@ def _picture_path(target: Path, name: str, force: bool) -> Path:
     return path
 
 
-def _find_experiment(run: str, folder: Path | None) -> Path | None:
+def _find_experiment(run: str, folder: Path) -> Path | None:
     """Return the folder of an experiment; None for a recording."""
-    path = files.expand_user(run) if "/" in run else (folder or runs_folder()) / run
+    path = files.expand_user(run) if "/" in run else folder / run
     return path if (path / EXPERIMENT).is_file() else None
 
 
-def _open_plotted(run: str, experiment: Path | None, folder: Path | None) -> Run | None:
+def _open_plotted(run: str, experiment: Path | None, folder: Path) -> Run | None:
     """Open a recording, or the last one of an experiment; None for one without a recording."""
     if experiment is None:
         return open_recording(run, folder)
@@ -213,7 +219,7 @@ def _draw_experiment(folder: Path, path: Path) -> None:
 @click.argument("file")
 @folder_option
 @json_option
-def recover(file: str, folder: Path | None, as_json: bool) -> None:
+def recover(file: str, folder: Path, as_json: bool) -> None:
     """Repair a recording that was cut off by a kill, a full disk or a power cut, or is damaged.
 
     FILE is a path, a name in the folder of recordings, or 'latest'. NAME.mcap.part becomes
@@ -262,7 +268,7 @@ def replay(
     speed: float,
     address: str,
     control: str | None,
-    folder: Path | None,
+    folder: Path,
     as_json: bool,
 ) -> None:
     """Publish a recording as fishd would, so that `fishctl watch` and PlotJuggler show it.

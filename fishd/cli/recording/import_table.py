@@ -46,7 +46,7 @@ def import_table(
     columns: str | None,
     rate: float | None,
     samples: int,
-    folder: Path | None,
+    folder: Path,
     subject: str,
     note: str,
     as_json: bool,

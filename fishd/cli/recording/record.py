@@ -22,7 +22,7 @@ from fishd.core import text
 from fishd.core.errors import FishError, NoDaemon, RecordingError
 from fishd.recording import RunWriter
 from fishd.recording.black_box import BlackBox
-from fishd.recording.folder import ensure_folder, open_new, recording_path, runs_folder
+from fishd.recording.folder import ensure_folder, open_new, recording_path
 from fishd.recording.recorder import MIN_FREE_BYTES, Position, Recorder
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ class _Record(click.Command):
 def record(
     run: str | None,
     endpoint: str | None,
-    folder: Path | None,
+    folder: Path,
     operator: str,
     subject: str,
     note: str,
@@ -130,7 +130,7 @@ def record(
         raise click.UsageError("a black box keeps no frames: they would fill it within hours")
     begin = partial(RunWriter, operator=operator, subject=subject, note=note)
     if black_box:
-        place = ensure_folder(folder or runs_folder())
+        place = ensure_folder(folder)
         box = BlackBox(place, keep, begin)
 
         def has_room() -> bool:
@@ -158,7 +158,7 @@ def record(
 def _record_one(
     run: str | None,
     endpoint: str | None,
-    folder: Path | None,
+    folder: Path,
     begin: Callable[[Path], RunWriter],
     seconds: float | None,
     as_json: bool,
@@ -168,7 +168,7 @@ def _record_one(
 
     begin: opens the recording at a path; seconds: longest duration [s]
     """
-    place = ensure_folder(folder or runs_folder())
+    place = ensure_folder(folder)
     progress = _draw if sys.stdout.isatty() and not as_json else lambda writer: None
     open_writer = (
         partial(begin, recording_path(run, place)) if run else partial(open_new, place, begin)

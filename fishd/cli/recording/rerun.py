@@ -26,7 +26,7 @@ def rerun(
     run: str,
     controller: str | None,
     overrides: tuple[str, ...],
-    folder: Path | None,
+    folder: Path,
     as_json: bool,
 ) -> int:
     """Run a controller again on each recorded tick, and compare its commands.

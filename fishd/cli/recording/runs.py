@@ -4,11 +4,10 @@ import shlex
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import click
 import msgspec
-from msgspec import Struct
 
 from fishd.cli.options import json_option
 from fishd.cli.output import echo, echo_table, format_count, print_json
@@ -18,13 +17,15 @@ from fishd.core import text
 from fishd.core.console import format_power
 from fishd.core.errors import ConfigError, RecordingError
 from fishd.lab.experiment import (
+    Answer,
     Header,
+    On,
     count_rows,
     find_answer,
     is_in_use,
     list_experiments,
 )
-from fishd.recording.folder import Overview, read_overviews, runs_folder
+from fishd.recording.folder import Overview, read_overviews
 from fishd.recording.notes import read_note
 from fishd.recording.summary import Summary
 
@@ -36,7 +37,7 @@ MAX_DURATION_S = 1e9
 @folder_option
 @json_option
 @click.pass_context
-def runs(ctx: click.Context, folder: Path | None, as_json: bool) -> int:
+def runs(ctx: click.Context, folder: Path, as_json: bool) -> int:
     """List recordings and experiments, each the oldest first, by their running numbers.
 
     'thrust' is the mean while the fish swam, in mN unless another unit is shown, with its 95 %
@@ -48,10 +49,9 @@ def runs(ctx: click.Context, folder: Path | None, as_json: bool) -> int:
     """
     if ctx.invoked_subcommand:
         return 0
-    place = folder or runs_folder()
-    recordings = list(read_overviews(place))
+    recordings = list(read_overviews(folder))
     readable = [entry for entry in recordings if isinstance(entry, Overview)]
-    experiments = [_ExperimentSummary.read(*entry) for entry in list_experiments(place)]
+    experiments = [_summarise(*entry) for entry in list_experiments(folder)]
     if as_json:
         print_json([*map(_to_json, readable), *experiments])
     else:
@@ -60,74 +60,37 @@ def runs(ctx: click.Context, folder: Path | None, as_json: bool) -> int:
         if experiments:
             _print_experiments(experiments)
         if not readable and not experiments:
-            echo(f"there is no recording in {place} yet; see 'fishctl record --help'")
+            echo(f"there is no recording in {folder} yet; see 'fishctl record --help'")
     errors = [entry for entry in recordings if isinstance(entry, RecordingError)]
-    problems = [str(error) for error in errors] + [e.problem for e in experiments if e.problem]
+    problems = [str(error) for error in errors] + [
+        e["problem"] for e in experiments if e["problem"]
+    ]
     for problem in problems:
         echo(f"fishctl: {problem}", err=True)
     return 1 if problems else 0
+
+
+_SHOWN_FACTS = ("kind", "on", "began", "force_unit", "command", "number")
 
 
 for verb in stored.VERBS:
     runs.add_command(verb)
 
 
-class _ExperimentSummary(Struct):
-    """Summary of an experiment."""
-
-    name: str
-    path: str
-    kind: str
-    on: str
-    began: str
-    rows: int | None
-    """Number of rows of its table; None without a table."""
-    state: str
-    """`running`, `finished`, `unfinished`, or empty where that is unknown."""
-    thrust: float | None = None
-    """Thrust of a measurement, or the largest of the results [N]."""
-    thrust_ci95: float | None = None
-    """Half-width of the 95 % confidence interval of `thrust`, statistical [N]."""
-    total_ci95: float | None = None
-    """The same with the calibration; None where that is not known [N]."""
-    summary: str = ""
-    """Result other than a thrust, in words."""
-    force_unit: str = "N"
-    command: list[str] = []
-    """Arguments of its verb."""
-    problem: str = ""
-    """Reason why it cannot be read; empty if it can."""
-    number: int = 0
-    """Running number, which gives the order; 0 without one."""
-    duration: float | None = None
-    """Tank time of the result, else time from begin to end; None where neither is known [s]."""
-    about: dict[str, str] = {}
-    """Note of the experiment and name of its fish (`subject`), where it has them."""
-
-    @classmethod
-    def read(cls, path: Path, header: "Header | ConfigError") -> "_ExperimentSummary":
-        """Return the summary of an experiment."""
-        if isinstance(header, ConfigError):
-            about = read_note(path)
-            problem = str(header)
-            return cls(path.name, str(path), "–", "–", "", None, "", problem=problem, about=about)
+def _summarise(path: Path, header: Header | ConfigError) -> dict[str, Any]:
+    """Return an experiment as the list shows it, also one that cannot be read."""
+    if isinstance(header, Header):
         answer = find_answer(path, header.kind)
-        return cls(
-            path.name,
-            str(path),
-            header.kind,
-            header.on,
-            header.began,
-            count_rows(path),
-            _find_state(path, header),
-            *answer[:4],
-            header.force_unit,
-            number=header.number,
-            command=header.command,
-            problem=answer.problem,
-            duration=_find_duration(header) if answer.seconds is None else answer.seconds,
-            about=_name_fish(header) | read_note(path),
-        )
+        rows, state = count_rows(path), _find_state(path, header)
+    else:
+        answer, rows, state = Answer(problem=str(header)), None, ""
+        header = Header(kind="–", on=cast(On, "–"))
+    facts = {name: getattr(header, name) for name in _SHOWN_FACTS}
+    duration = _find_duration(header) if answer.duration is None else answer.duration
+    return {
+        "name": path.name, "path": str(path), **facts, "rows": rows, "state": state,
+        **answer._asdict(), "duration": duration, "about": _name_fish(header) | read_note(path),
+    }  # fmt: skip
 
 
 def _find_duration(header: Header) -> float | None:
@@ -150,7 +113,7 @@ def _find_state(path: Path, header: Header) -> str:
     return "" if header.ended is None else "finished" if header.ended else "unfinished"
 
 
-def _print_experiments(experiments: list[_ExperimentSummary]) -> None:
+def _print_experiments(experiments: list[dict[str, Any]]) -> None:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
@@ -161,22 +124,20 @@ def _print_experiments(experiments: list[_ExperimentSummary]) -> None:
         table.add_column(head, justify="right", no_wrap=True)
     table.add_column("about", overflow="fold")
     for experiment in experiments:
+        rows, duration = experiment["rows"], experiment["duration"]
+        half_width = experiment["total_ci95"] or experiment["thrust_ci95"]
+        state = "" if experiment["state"] == "finished" else experiment["state"]
+        about = [state, experiment["summary"], text.line(experiment["about"].get("note", ""))]
         table.add_row(
-            text.line(experiment.name),
-            _format_start(experiment.began),
-            text.line(f"{experiment.kind} {shlex.join(experiment.command)}".strip()),
-            "–" if experiment.duration is None else _format_duration(experiment.duration),
-            "–" if experiment.rows is None else str(experiment.rows),
-            _format_thrust(experiment),
-            _format_about(experiment),
+            text.line(experiment["name"]),
+            _format_start(experiment["began"]),
+            text.line(f"{experiment['kind']} {shlex.join(experiment['command'])}".strip()),
+            "–" if duration is None else _format_duration(duration),
+            "–" if rows is None else str(rows),
+            _format_thrust(experiment["thrust"], half_width, experiment["force_unit"]),
+            "; ".join(filter(None, about)),
         )
     echo_table(table)
-
-
-def _format_about(experiment: _ExperimentSummary) -> str:
-    state = "" if experiment.state == "finished" else experiment.state
-    note = text.line(experiment.about.get("note", ""))
-    return "; ".join(filter(None, [state, experiment.summary, note]))
 
 
 def _to_json(glance: Overview) -> dict[str, Any]:
@@ -207,7 +168,7 @@ def _print_recordings(recordings: list[Overview]) -> None:
             text.line(glance.name),
             _format_start(glance.about.get("started", "")),
             _format_duration(summary.duration),
-            _format_thrust(summary),
+            _format_thrust(summary.thrust, summary.thrust_ci95, summary.force_unit),
             format_power(summary.readings["power"]) if "power" in summary.readings else "–",
             str(summary.ticks),
             str(summary.lost_ticks),
@@ -218,17 +179,15 @@ def _print_recordings(recordings: list[Overview]) -> None:
     echo_table(table)
 
 
-def _format_thrust(summary: "Summary | _ExperimentSummary") -> str:
+def _format_thrust(thrust: float | None, half_width: float | None, force_unit: str) -> str:
     """Return the thrust in mN, or thousandths of another unit, with its interval if known."""
-    if summary.thrust is None:
+    if thrust is None:
         return "–"
-    half_width = getattr(summary, "total_ci95", None) or summary.thrust_ci95
     error = "?" if half_width is None else _format_thousandths(half_width)
-    unit = "" if summary.force_unit == "N" else f" m{text.quoted(summary.force_unit)}"
     if error == "0.00":  # a thrust without noise
-        name = "" if summary.force_unit == "N" else summary.force_unit
-        return text.format_measured(summary.thrust, half_width, name)
-    return f"{_format_thousandths(summary.thrust)} ± {error}{unit}"
+        return text.format_measured(thrust, half_width, "" if force_unit == "N" else force_unit)
+    unit = "" if force_unit == "N" else f" m{text.quoted(force_unit)}"
+    return f"{_format_thousandths(thrust)} ± {error}{unit}"
 
 
 def _format_thousandths(value: float) -> str:

@@ -1,17 +1,21 @@
 """The verbs below `fishctl runs`: note, rename, delete and its undo, results, and a zip file."""
 
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import click
 
 from fishd.cli.options import F, Utf8Text, json_option
 from fishd.cli.output import echo, echo_table, format_count, print_json, print_paths
+from fishd.cli.progress import format_estimate
 from fishd.cli.recording.files import folder_option
 from fishd.core import text
 from fishd.core.errors import RecordingError
+from fishd.core.experiments import Estimate
+from fishd.core.files import os_errors
 from fishd.recording import stored_runs
-from fishd.recording.folder import check_new_files, runs_folder
+from fishd.recording.folder import check_new_files
 
 
 def _options(function: F) -> F:
@@ -19,24 +23,17 @@ def _options(function: F) -> F:
     return folder_option(json_option(function))
 
 
-def _find_folder(folder: Path | None) -> Path:
-    """Return the folder of runs: of this verb, else of `fishctl runs --folder`."""
-    context = click.get_current_context()
-    given = context.parent.params.get("folder") if context.parent else None
-    return folder or given or runs_folder()
-
-
 @click.command()
 @click.argument("run")
 @click.argument("note", type=Utf8Text())
 @_options
-def note(run: str, note: str, folder: Path | None, as_json: bool) -> None:
+def note(run: str, note: str, folder: Path, as_json: bool) -> None:
     """Replace the note of a run by NOTE.
 
     It is in a text file beside a recording, which itself stays unchanged, or in the folder of an
     experiment. All verbs, tables and figures use it.
     """
-    path = stored_runs.find_stored_run(run, _find_folder(folder))
+    path = stored_runs.find_stored_run(run, folder)
     stored_runs.set_note(path, note)
     print_paths([path], as_json)
 
@@ -45,22 +42,21 @@ def note(run: str, note: str, folder: Path | None, as_json: bool) -> None:
 @click.argument("run")
 @click.argument("name", type=Utf8Text())
 @_options
-def rename(run: str, name: str, folder: Path | None, as_json: bool) -> None:
+def rename(run: str, name: str, folder: Path, as_json: bool) -> None:
     """Rename a run that is not in progress to NAME."""
-    path = stored_runs.find_stored_run(run, _find_folder(folder))
+    path = stored_runs.find_stored_run(run, folder)
     print_paths([stored_runs.rename_run(path, name)], as_json)
 
 
 @click.command()
 @click.argument("runs", nargs=-1, required=True)
 @_options
-def delete(runs: tuple[str, ...], folder: Path | None, as_json: bool) -> None:
+def delete(runs: tuple[str, ...], folder: Path, as_json: bool) -> None:
     """Move runs into the trash, where they are kept for 30 days.
 
     'fishctl runs restore' brings them back; until then they take space on the disk.
     """
-    place = _find_folder(folder)
-    paths = [stored_runs.find_stored_run(run, place) for run in runs]
+    paths = [stored_runs.find_stored_run(run, folder) for run in runs]
     deleted = list(map(stored_runs.delete_run, paths))
     if as_json:
         print_json(deleted)
@@ -71,13 +67,12 @@ def delete(runs: tuple[str, ...], folder: Path | None, as_json: bool) -> None:
 @click.command()
 @click.option("--empty", is_flag=True, help="Remove all that is in the trash.")
 @_options
-def trash(empty: bool, folder: Path | None, as_json: bool) -> None:
+def trash(empty: bool, folder: Path, as_json: bool) -> None:
     """List the deleted runs, the latest first, or remove them."""
-    place = _find_folder(folder)
     if empty:
-        count = stored_runs.empty_trash(place)
+        count = stored_runs.empty_trash(folder)
         echo(f"{format_count(count, 'run')} removed", err=as_json)
-    deleted = stored_runs.list_trash(place)
+    deleted = stored_runs.list_trash(folder)
     if as_json:
         print_json(deleted)
     for run in () if as_json else deleted:
@@ -87,12 +82,12 @@ def trash(empty: bool, folder: Path | None, as_json: bool) -> None:
 @click.command()
 @click.argument("run")
 @_options
-def restore(run: str, folder: Path | None, as_json: bool) -> None:
+def restore(run: str, folder: Path, as_json: bool) -> None:
     """Bring a run back from the trash.
 
     RUN is its name, or its line in 'fishctl runs trash'.
     """
-    print_paths([stored_runs.restore_run(run, _find_folder(folder))], as_json)
+    print_paths([stored_runs.restore_run(run, folder)], as_json)
 
 
 @click.command(name="zip")
@@ -105,32 +100,28 @@ def restore(run: str, folder: Path | None, as_json: bool) -> None:
     help="File to write, or - for the standard output. [default: RUN.zip in this folder]",
 )
 @folder_option
-def pack(run: str, target: Path | None, folder: Path | None) -> None:
+def pack(run: str, target: Path | None, folder: Path) -> None:
     """Write all files of a run into one zip file."""
-    path = stored_runs.find_stored_run(run, _find_folder(folder))
+    path = stored_runs.find_stored_run(run, folder)
     target = target or Path(f"{run}.zip")
-    try:
-        if str(target) == "-":
-            stored_runs.pack_run(path, sys.stdout.buffer)
-            return
-        check_new_files([target], replace=False)
+    if str(target) == "-":
+        stored_runs.pack_run(path, sys.stdout.buffer)
+        return
+    if path.resolve() in target.resolve().parents:
+        raise RecordingError(f"{target} would contain itself: write it outside of {path}")
+    check_new_files([target], replace=False)
+    with os_errors(RecordingError, f"{target} cannot be written"), ExitStack() as stack:
         with target.open("xb") as file:
+            stack.callback(target.unlink)
             stored_runs.pack_run(path, file)
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise (
-            error
-            if isinstance(error, RecordingError)
-            else RecordingError(f"{target} cannot be written: {error.strerror}")
-        ) from None
+        stack.pop_all()
     echo(target)
 
 
 @click.command()
 @click.argument("runs", nargs=-1, required=True)
 @_options
-def show(runs: tuple[str, ...], folder: Path | None, as_json: bool) -> None:
+def show(runs: tuple[str, ...], folder: Path, as_json: bool) -> None:
     """Show the results of runs side by side.
 
     Intervals are 95 % confidence intervals. A search shows its answer, not the luckiest of its
@@ -140,8 +131,7 @@ def show(runs: tuple[str, ...], folder: Path | None, as_json: bool) -> None:
 
     from fishd.lab.run_results import QUANTITIES, read_results
 
-    place = _find_folder(folder)
-    results = [read_results(stored_runs.find_stored_run(run, place)) for run in runs]
+    results = [read_results(stored_runs.find_stored_run(run, folder)) for run in runs]
     if as_json:
         print_json(results)
         return
@@ -160,9 +150,7 @@ def show(runs: tuple[str, ...], folder: Path | None, as_json: bool) -> None:
     echo_table(table)
     for result in results:
         for estimate in result.estimates:
-            low, high = (f"{end:.4g}" if end is not None else "?" for end in estimate[2:4])
-            unit = f" {estimate.unit}" if estimate.unit not in ("", "1") else ""
-            echo(f"{result.name}: {estimate.name} {estimate.value:.4g}{unit} [{low}, {high}]")
+            echo(f"{result.name}: {format_estimate(Estimate(*estimate))}")
         if result.summary:
             echo(f"{result.name}: {result.summary}")
 

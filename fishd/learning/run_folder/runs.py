@@ -17,7 +17,7 @@ from fishd.config import Config
 from fishd.controllers.policy.card import Card, Feature, Provenance
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
-from fishd.core.files import write_atomically
+from fishd.core.files import os_errors, write_atomically
 from fishd.lab.experiment import On, mark_folder
 from fishd.learning import settings as training
 from fishd.learning.env.evaluation import Evaluation
@@ -39,15 +39,13 @@ def create(
     command: arguments of `fishctl learn ppo`
     camera: camera that sees a simulated fish
     """
-    try:
+    with os_errors(ConfigError, f"{folder}: cannot be made"):
         mark_folder(folder, "learn ppo", on, command)
         write_atomically(folder / CONFIG, configuration.to_yaml(config))
         write_settings(folder, settings)
         if camera:
             seen = cameras.CameraSettings(simulated=_without_address(camera))
             write_atomically(folder / CAMERA, cameras.to_yaml(seen))
-    except OSError as error:
-        raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from None
 
 
 def write_settings(folder: Path, settings: TrainingSettings) -> None:

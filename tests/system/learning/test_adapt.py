@@ -103,6 +103,9 @@ class StoringDisplay:
     def at(self, amount: float, text: str | None = None) -> None:
         pass
 
+    def estimate(self, *_: object) -> None:
+        pass
+
     def warn(self, line: str) -> None:
         self.lines.append(line)
 

@@ -14,7 +14,6 @@ from rigs.page_server import PageServer
 
 from fishd.core.errors import StartupError
 from fishd.window import places, web_server
-from fishd.window.camera_feed import Picture
 
 FACTS = "streaming"
 
@@ -42,7 +41,7 @@ async def receive_picture(sock: aiohttp.ClientWebSocketResponse) -> tuple[str, b
 async def test_a_page_gets_pictures_with_their_facts() -> None:
     async with run_server() as (server, session):
         server.show(FACTS)
-        server.show(Picture("tail", b"first"))
+        server.show(("tail", b"first"))
         async with session.ws_connect("/live") as sock:
             assert await sock.receive_str() == FACTS
             assert await receive_picture(sock) == ("tail", b"first")
@@ -55,7 +54,7 @@ async def test_a_page_gets_the_newest_picture_once_it_has_drawn_the_last_one() -
         while not server.viewers:
             await asyncio.sleep(0.01)
         for number in range(200):
-            server.show(Picture(str(number), bytes([number])))
+            server.show((str(number), bytes([number])))
             if number == 0:
                 assert await receive_picture(sock) == ("0", b"\x00")
         server.show(FACTS)
@@ -110,7 +109,7 @@ async def test_an_end_does_not_wait_for_pages_that_never_read_or_connections_tha
             writer.write(sent)
             await writer.drain()
         assert (await loop.sock_recv(deaf, 12)).endswith(b" 101")
-        server.show(Picture("", bytes(20 * 2**20)))  # more than all buffers hold
+        server.show(("", bytes(20 * 2**20)))  # more than all buffers hold
         await asyncio.sleep(0.1)
         ending = time.monotonic()
     ended = time.monotonic() - ending
@@ -235,6 +234,6 @@ async def test_half_a_request_is_ended_soon(sent: bytes, monkeypatch: pytest.Mon
 async def test_a_port_that_is_taken_is_one_line() -> None:
     async with run_server() as (server, _):
         port = int(server.url.rsplit(":", 1)[1].strip("/"))
-        with pytest.raises(StartupError, match=r"cannot serve a page at .*; name another port"):
+        with pytest.raises(StartupError, match=r"cannot serve a page at .*; name another one with"):
             async with PageServer("127.0.0.1", port):
                 pass

@@ -108,11 +108,11 @@ async def test_the_checks_are_those_of_doctor_and_run_once_for_all_pages_that_wa
 ) -> None:
     counted = f"""
 from fishd.window import inspection
-call = inspection.call
+call = inspection.call_json
 async def counting(words, runs):
     open({str(tmp_path / "calls")!r}, "a").write(words[0] + "\\n")
     return await call(words, runs)
-inspection.call = counting
+inspection.call_json = counting
 """
     with running_window(tmp_path, changes=counted, fish=daemon.endpoint) as window:
         async with Browser(window.url) as browser:

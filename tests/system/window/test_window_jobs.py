@@ -278,7 +278,7 @@ async def test_no_other_job_is_stopped_by_a_wrong_number(window: WindowProcess) 
         assert await page.refusal("/api/jobs/99/stop") == (409, "job")
 
 
-async def test_an_experiment_that_is_lost_with_its_window_is_listed_by_the_next_one_and_resumed(
+async def test_an_experiment_that_is_lost_with_its_window_is_an_unfinished_run_of_the_next_one(
     new_window: WindowProcess, daemon: Daemon, tmp_path: Path
 ) -> None:
     async with Browser(new_window.url) as browser, open_page(browser) as page:
@@ -289,13 +289,12 @@ async def test_an_experiment_that_is_lost_with_its_window_is_listed_by_the_next_
     wait_until(lambda: daemon.status().mode == "idle" and daemon.status().lease is None)
     with running_window(tmp_path, fish=daemon.endpoint) as window:
         async with Browser(window.url) as browser, open_page(browser) as page:
-            (lost,) = page.hello["jobs"]
-            assert (lost["state"], lost["resumable"]) == ("lost", True)
-            assert "the fish came to rest; what was measured until then" in lost["lines"][-1]
+            assert page.hello["jobs"] == []
+            (lost,) = [run for run in await browser.get("/api/runs") if run["kind"] == "measure"]
+            assert lost["state"] == "unfinished"
             await page.drive()
-            job = await start(page, "resume", run=lost["run"])
+            job = await start(page, "resume", run=lost["name"])
             assert job["command"][:3] == ["fishctl", "measure", "--resume"]
-            await page.until("job", lambda j: j["id"] == lost["id"] and not j["resumable"])
             await page.until("ticks", lambda ticks: ticks[-1]["controller"] == "square")
             await page.post(f"/api/jobs/{job['id']}/stop")
             assert (await end_of(page, job))["state"] == "stopped"

@@ -58,7 +58,10 @@ def test_a_wrong_option_is_one_line(tmp_path: Path, words: list[str], complaint:
     [
         ("fishes: {}", "fishes: unknown key; did you mean 'fish'?"),
         ("cameras: {tuna: ipc:///x}", "cameras.tuna: is not the name of a fish; here: fish"),
-        ("cameras: {fish: /dev/video0}", "'/dev/video0' is not valid: tcp://HOST:PORT or ipc://"),
+        (
+            "cameras: {fish: /dev/video0}",
+            "cameras.fish: '/dev/video0' is not valid: tcp://HOST:PORT or ipc://",
+        ),
     ],
 )
 def test_a_wrong_key_is_named_with_its_line(tmp_path: Path, line: str, complaint: str) -> None:

@@ -1,13 +1,16 @@
 """The forms of a page, made from the verbs of the command line."""
 
 import importlib.util
+from contextlib import nullcontext
 
+import msgspec
 import pytest
 
 from fishd.cli.experiment_options import RUN_ONLY_OPTIONS
 from fishd.cli.forms import describe_forms
 from fishd.cli.main import VERBS
 from fishd.core.experiments import Form
+from fishd.window.job_options import make_options
 
 FORBIDDEN_OPTIONS = {
     *RUN_ONLY_OPTIONS,
@@ -48,6 +51,16 @@ def test_the_help_of_a_field_speaks_of_no_command_line() -> None:
     helps = [field.description for form in forms().values() for field in form.fields]
     helps += [form.about for form in forms().values()]
     assert [text for text in helps if "--" in text or "Ctrl-C" in text] == []
+
+
+@pytest.mark.parametrize(
+    ("run", "is_valid"),
+    [("größer 2.mcap", True), ("-x", False), ("../x", False), ("~x", False), ("x\n", False)],
+)
+def test_a_run_of_any_language_is_an_argument_and_nothing_else_is(run: str, is_valid: bool) -> None:
+    options = make_options(forms()["rerun"])
+    with nullcontext() if is_valid else pytest.raises(msgspec.ValidationError):
+        msgspec.convert({"run": run}, options)
 
 
 def test_a_form_says_which_package_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

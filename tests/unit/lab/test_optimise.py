@@ -157,7 +157,7 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     assert find_answer(folder)[:3] == tuple(
         answer[key] for key in ("thrust", "thrust_ci95", "total_ci95")
     )
-    assert re.match(r"best: frequency=[\d.]+ \[", find_answer(folder).summary)
+    assert re.match(r"best frequency [\d.]+ Hz \[", find_answer(folder).summary)
     table = (folder / "rows.csv").read_text()
     more = fishctl(*again.split(), "60")
     assert f"{folder}: 2 candidates measured already" in more.stdout

@@ -155,6 +155,10 @@ def test_several_runs_are_drawn_over_each_other(recordings: Path, tmp_path: Path
     svg = tmp_path / "both.svg"
     assert fishctl(*words, "--from", "1", "--to", str(svg)).returncode == 0
     assert all(f"<!-- {text} -->" in svg.read_text() for text in ("slow", "fast", "tail beat (Hz)"))
+    (tmp_path / "slow.mcap").write_bytes((recordings / "fast.mcap").read_bytes())
+    same = ("plot", str(recordings / "slow.mcap"), str(tmp_path / "slow.mcap"), "--force")
+    assert fishctl(*same, "--to", str(svg)).returncode == 0
+    assert svg.read_text().count("<!-- slow -->") == 2, "runs of one name in two folders"
     empty = write_experiment(tmp_path / "empty", "sweep", [])
     drawn = fishctl(*words, str(empty), "--to", str(svg), "--force")
     assert drawn.returncode == 0

@@ -147,11 +147,15 @@ NAMES = [
     "a" * 101,
     "x.part",
     "a\x1b",
+    "latest",
+    "queue.json",
+    "noted",
 ]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_no_run_gets_a_name_that_is_taken_or_leads_elsewhere(folder: Path, name: str) -> None:
+    (folder / "noted.note.txt").write_text("of a recording that was removed by hand")
     for run in ("first", "swept"):
         line = refuse(folder, "rename", run, "--", name)
         assert "exists already" in line or "cannot be a name: letters, digits" in line
@@ -211,6 +215,41 @@ def test_a_full_disk_is_one_line_and_changes_nothing(
     assert line.endswith("No space left on device\n")
 
 
+def test_a_zip_file_for_which_the_disk_is_too_full_leaves_no_part(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stored_runs.shutil, "copyfileobj", no_space)
+    line = refuse(folder, "zip", "swept", "--to", str(folder / "x.zip"))
+    assert "x.zip cannot be written: No space" in line
+
+
+def test_a_file_whose_name_is_not_text_is_packed_under_a_similar_one(folder: Path) -> None:
+    (folder / "swept" / os.fsdecode(b"fish\xff")).write_bytes(b"x")
+    stream = io.BytesIO()
+    stored_runs.pack_run(folder / "swept", stream)
+    with zipfile.ZipFile(stream) as archive:
+        assert archive.read("swept/fish?") == b"x"
+
+
+def test_two_programs_delete_and_empty_at_once(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    delete_run(folder / "first.mcap")
+    (place,) = (folder / TRASH).iterdir()
+    taken, find_unused = [place], stored_runs.files.unused_path
+    monkeypatch.setattr(
+        stored_runs.files,
+        "unused_path",
+        lambda *names: taken.pop() if taken else find_unused(*names),
+    )
+    assert delete_run(folder / "swept").id != place.name
+    gone = folder / TRASH / "20260101-000000"
+    monkeypatch.setattr(stored_runs, "_list_places", lambda _: [gone, place])
+    assert [run.name for run in list_trash(folder)] == ["first"]
+    empty_trash(folder)
+    assert list_trash(folder) == []
+
+
 def test_a_trash_that_is_a_link_takes_nothing(
     folder: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -245,6 +284,7 @@ def test_a_zip_file_has_all_files_of_a_run_and_nothing_else(
         assert set(archive.namelist()) == {f"swept/{name}" for name in names}
         assert archive.read("swept/rows.csv") == (swept / "rows.csv").read_bytes()
         assert archive.testzip() is None
+    assert "write it outside" in refuse(folder, "zip", "swept", "--to", "swept/x.zip")
     stream = io.BytesIO()
     stored_runs.pack_run(folder / "first.mcap", stream)
     with zipfile.ZipFile(stream) as archive:

@@ -4,7 +4,7 @@ import errno
 import os
 import platform
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -21,7 +21,7 @@ from fishd.cli.doctor.computer import read_throttled
 from fishd.cli.output import echo, print_json
 from fishd.core.clock import SystemClock
 from fishd.core.errors import ConfigError, FishError, ServoError, StartupError
-from fishd.core.files import write_atomically
+from fishd.core.files import os_errors, write_atomically
 from fishd.core.process.interruption import raise_on_first_signal
 from fishd.hardware.checks import Result, ok, skipped, warning
 from fishd.hardware.force_sensor.ads1115 import Ads1115Settings
@@ -121,7 +121,8 @@ def run(bench: Bench, output: Path, print_line: Print | None) -> int:
     now = datetime.now(UTC)
     stem = output / f"fishd-bench-{now:%Y%m%d-%H%M%S}"
     report = BenchReport(f"{now:%Y-%m-%d}", describe_board(context))
-    with _explain_folder(output):  # before the measurement, not after it
+    unwritable = f"--to {output}: cannot be written"
+    with os_errors(ConfigError, unwritable):  # before the measurement, not after it
         output.mkdir(parents=True, exist_ok=True)
         if not os.access(output, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
@@ -131,7 +132,7 @@ def run(bench: Bench, output: Path, print_line: Print | None) -> int:
             if print_line:
                 print_line(name, result)
     report.board = msgspec.structs.replace(report.board, temperature=_temperature(context))
-    with _explain_folder(output):
+    with os_errors(ConfigError, unwritable):
         data = msgspec.json.format(msgspec.json.encode(report), indent=1)
         write_atomically(stem.with_suffix(".json"), data + b"\n", new=True)
         write_atomically(stem.with_suffix(".md"), page(report), new=True)
@@ -140,15 +141,6 @@ def run(bench: Bench, output: Path, print_line: Print | None) -> int:
     else:
         print_json(report)
     return int(any(finding.level == "FAIL" for finding in report.findings))
-
-
-@contextmanager
-def _explain_folder(folder: Path) -> Iterator[None]:
-    """Translate errors of writing into a folder to `ConfigError`."""
-    try:
-        yield
-    except OSError as error:
-        raise ConfigError(f"--to {folder}: cannot be written: {error.strerror}") from None
 
 
 def _measure(bench: Bench, report: BenchReport) -> Iterator[tuple[str, Result]]:
