@@ -41,6 +41,7 @@ def test_a_physicist_needs_no_terminal_after_the_link(
 
         go(page, "runs")
         runs = page.locator("#runs")
+        expect(runs.locator(".pick input")).to_have_count(2)
         for run in range(2):
             runs.locator(".pick input").nth(run).check()
         page.get_by_role("button", name="Compare 2").click()
