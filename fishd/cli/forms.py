@@ -53,6 +53,7 @@ _SOURCES = {
     "rerun": _Source("Rerun", argument="run", packages=("pandas",)),
 }  # fmt: skip
 """Verb of each form, in the order of a page."""
+_ON_HELP = "live: the fish of this page; simulation: a simulated fish in virtual time."
 _LEFT_OUT = {*RUN_ONLY_OPTIONS, "--force", "--jobs", "--seeds", "--black-box"} - {"--on"}
 """Options that no page gives: where results go, which fishd, how many processes."""
 
@@ -110,7 +111,8 @@ def _describe_option(option: click.Option, source: _Source) -> FormField | None:
     default = option.default if isinstance(option.default, bool | int | float | str) else None
     more: dict[str, Any] = {}
     if name == "on":
-        described, default, more = "choice", "live", {"choices": ("live", "simulation")}
+        described, default = "choice", "live"
+        more = {"choices": ("live", "simulation"), "description": _ON_HELP}
     elif option.is_flag:
         described, default = "boolean", False
     elif isinstance(kind, click.Choice):

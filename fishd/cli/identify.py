@@ -34,7 +34,7 @@ DEFAULT_EXPERIMENT_S = 180.0
         "--experiment", is_flag=True, help="First swim an experiment for the identification."
     ),
     for_option(
-        f"With --experiment: its duration [s]. [default: {DEFAULT_EXPERIMENT_S:g}]",
+        f"Duration of the experiment [s]. [default: {DEFAULT_EXPERIMENT_S:g}]",
         kind=FiniteRange(min=30.0, max=3600.0),
     ),
     click.option(
@@ -68,7 +68,7 @@ DEFAULT_EXPERIMENT_S = 180.0
         metavar="FRACTION",
         default=0.01,
         show_default=True,
-        help="With --tail: half-width of the 95 % interval of the scale of fin angles.",
+        help="Half-width of the 95 % interval of the scale of fin angles.",
     ),
     tail="Use fin angles that a camera measures, for K, λ, K_y and K_d each for itself.",
     plot="forces, fit and residual",

@@ -19,7 +19,7 @@ from fishd.core import files, text
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import ConfigError, FishError
 from fishd.core.experiment_queue import MAX_PAST, Item, Outcome, Past, Queue, QueueError, QueueFile
-from fishd.core.experiments import PROGRESS_PREFIX
+from fishd.core.experiments import EXPERIMENT_PREFIX, PROGRESS_PREFIX
 from fishd.core.process.fishctl_child import fishctl_command
 from fishd.core.process.interruption import SIGNALS, handle_signals
 from fishd.lab.experiment import Header, find_answer, read_header
@@ -124,7 +124,7 @@ class QueueRunner:
         take = ["--take"] if self._take else []
         words = ["--endpoint", self._file.address, *place, str(folder), *take]
         self._take, self._last_line = False, ""
-        _print_line(f"fishctl: experiment {item.id}: {' '.join(item.words)}")
+        _print_line(f"{EXPERIMENT_PREFIX.decode()}{item.id}: {' '.join(item.words)}")
         try:
             # Another session, as Ctrl-C in this terminal is for the runner.
             child = subprocess.Popen(

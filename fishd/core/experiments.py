@@ -10,6 +10,8 @@ PROGRESS_VARIABLE = "FISHD_PROGRESS"
 """Environment variable; if it is `json`, experiments print their progress as `Progress`."""
 PROGRESS_PREFIX = b'{"progress":'
 """Begin of such a line on standard error."""
+EXPERIMENT_PREFIX = b"fishctl: experiment "
+"""Begin of the line of a queue before each of its experiments."""
 
 
 class FormField(Field, frozen=True, omit_defaults=True):

@@ -21,7 +21,14 @@ from msgspec.structs import replace
 from fishd.core import files, text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError
-from fishd.core.experiments import PROGRESS_PREFIX, CurvePoint, Form, Plan, Progress
+from fishd.core.experiments import (
+    EXPERIMENT_PREFIX,
+    PROGRESS_PREFIX,
+    CurvePoint,
+    Form,
+    Plan,
+    Progress,
+)
 from fishd.window.children import JobError, spawn
 from fishd.window.exports import read_curve
 from fishd.window.forms import Forms
@@ -334,6 +341,8 @@ class Jobs:
 
 def _take_line(job: Job, line: bytes) -> None:
     """Add a line of a job: its progress, or a text."""
+    if line.startswith(EXPERIMENT_PREFIX):  # the next one of a queue
+        job.progress, job.points = None, []
     if line.startswith(PROGRESS_PREFIX):
         with suppress(msgspec.DecodeError):
             progress, before = _decode_report(line).progress, job.progress

@@ -81,7 +81,7 @@ class _Record(click.Command):
 )
 @click.option("--subject", type=Utf8Text(), default="", help="Name or number of the fish.")
 @click.option("--note", type=Utf8Text(), default="", help="Purpose of the recording.")
-@for_option("End by itself after this time [s]; by default Ctrl-C ends it.")
+@for_option("End by itself after this time [s]; by default it ends when it is stopped.")
 @json_option
 @click.option(
     "--camera",
@@ -114,10 +114,11 @@ def record(
     keep: int,
     as_json: bool,
 ) -> None:
-    """Record a running fish: every tick, event and status, until Ctrl-C or SIGTERM.
+    """Record a running fish: every tick, event and status.
 
-    RUN is a name in the folder of recordings or a path; by default the date and time. The
-    recording survives a restart of fishd. No older recording is ever overwritten.
+    Ctrl-C or SIGTERM ends it. RUN is a name in the folder of recordings or a path; by default the
+    date and time. The recording survives a restart of fishd. No older recording is ever
+    overwritten.
 
     Exit status: 0 if every tick is in the file; 3 if ticks or frames were lost, or may have been,
     as a line then says; 1 if the recording could not begin or the disk failed. A black box reports

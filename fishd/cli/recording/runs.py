@@ -89,7 +89,7 @@ def _summarise(path: Path, header: Header | ConfigError) -> dict[str, Any]:
     duration = _find_duration(header) if answer.duration is None else answer.duration
     return {
         "name": path.name, "path": str(path), **facts, "rows": rows, "state": state,
-        **answer._asdict(), "duration": duration, "about": read_note(path),
+        **answer._asdict(), "duration": duration, "about": _name_fish(header) | read_note(path),
     }  # fmt: skip
 
 
@@ -99,6 +99,12 @@ def _find_duration(header: Header) -> float | None:
         begin, end = map(datetime.fromisoformat, (header.began, header.ended or ""))
         return max(0.0, (end - begin).total_seconds())
     return None
+
+
+def _name_fish(header: Header) -> dict[str, str]:
+    """Return the name of the fish in its configuration, as the subject of an experiment."""
+    name = header.config.get("name")
+    return {"subject": name} if isinstance(name, str) else {}
 
 
 def _find_state(path: Path, header: Header) -> str:

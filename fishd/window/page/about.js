@@ -9,7 +9,7 @@ const PILLS = { ok: "running", warning: "stale", FAIL: "fault", skipped: "" };
 function ageOf(date) {
   const hours = (Date.now() - new Date(date)) / (DAY_MS / 24);
   if (!Number.isFinite(hours)) return "";
-  return hours < 48 ? `${number(Math.max(0, hours), 0)} h ago` : `${number(hours / 24, 0)} days ago`;
+  return hours < 1 ? "less than 1 h ago" : hours < 48 ? `${number(Math.max(0, hours), 0)} h ago` : `${number(hours / 24, 0)} days ago`;
 }
 
 const gigabytes = (bytes) => `${number(bytes / 1e9, 1)} GB`;

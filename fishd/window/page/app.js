@@ -7,7 +7,7 @@ import { Camera } from "./camera.js";
 import { ChartTools, MarkForm } from "./chart_tools.js";
 import { Charts } from "./charts.js";
 import { Drive, driverName, request } from "./controls.js";
-import { Experiments, plain, triedThrust } from "./experiments.js";
+import { Experiments, plain, titleOf, triedThrust } from "./experiments.js";
 import { defaultOf } from "./fields.js";
 import { TopView } from "./fish.js";
 import { Ring, ticksOf } from "./ring.js";
@@ -127,7 +127,7 @@ const receive = {
     if (job.state === "dismissed") state.jobs.delete(job.id);
     else state.jobs.set(job.id, job);
     if (before?.state === "running" && job.state !== "running") {
-      notice(job.state === "failed" ? "error" : "info", `${job.kind}: ${job.state}`, job.state === "failed" || job.kind === "queue" ? plain(job.lines?.at(-1) ?? "") : "");
+      notice(job.state === "failed" ? "error" : "info", `${titleOf(state, job.kind)}: ${job.state}`, job.state === "failed" || job.kind === "queue" ? plain(job.lines?.at(-1) ?? "") : "");
     }
     changed();
   },
@@ -444,7 +444,7 @@ function Events() {
       ${events.map((event) => html`<li key=${`${event.t}${event.kind}`} class=${event.level}><time>${timeOfDay(event.t)}</time>
         <span class="kind">${event.kind}</span><span>${event.message}</span></li>`)}</ol>`}
     ${state.status?.limitations?.map((line) => html`<p class="foot">Limitation: ${line}.</p>`)}
-    ${state.session && !state.session.loopback && state.session.paired && html`<p class="foot">Paired as ${state.session.device || "this device"}.
+    ${state.session && !state.session.loopback && state.session.paired && html`<p class="foot">Paired as ${state.session.device || "this device"}.${" "}
       <button type="button" class="link" onClick=${() => call("POST", "/api/unpair", {}).then(() => location.reload())}>Forget this device</button></p>`}`;
 }
 

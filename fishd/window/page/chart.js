@@ -119,7 +119,9 @@ export class Chart {
     this.plot.batch(() => {
       this.plot.setData(this.data, false);
       this.plot.setScale("x", { min, max });
+      if (this.isLive !== this.owner.view.isLive) this.plot.redraw(false, true); // "latest" and times are other labels
     });
+    this.isLive = this.owner.view.isLive;
     this.read();
   }
 
@@ -140,7 +142,7 @@ export class Chart {
     return {
       width: 300,
       height: HEIGHT,
-      padding: [() => (owner.first === this ? 15 : 6), () => (owner.view.isLive ? 16 : 24), 0, 0],
+      padding: [() => (owner.first === this ? 15 : 6), () => (owner.view.isLive ? 16 : 28), 0, 0],
       pxAlign: 1,
       legend: { show: false },
       cursor: { sync: { key: "fish", setSeries: false }, drag: { x: false, y: false }, points: { size: 6 } },

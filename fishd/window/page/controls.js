@@ -50,7 +50,7 @@ export function Drive({ state, act, changed, changeRole, experiment }) {
     <h2 id="drive-title" class="unseen">Controller</h2>
     ${!mayDrive && html`<p class="note">This device may only watch and use the E‑stop.</p>`}
     ${experiment && html`<p class="note">The experiment <b>${experiment.name}</b> (process ${experiment.pid}${experiment.host && ` on ${experiment.host}`})
-      holds the fish. Stop ends it.</p>`}
+      holds the fish.${mayDrive && " Stop ends it."}</p>`}
     ${mayDrive && html`<div class="role">
       <span>${other ? html`<b>${driverName(state).replace(/^another page$/, "Another page")}</b> drives` : state.driver ? "You drive" : "No page drives"}</span>
       ${state.driver?.you_drive

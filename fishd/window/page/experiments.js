@@ -22,6 +22,9 @@ export async function startJob({ state, notice, changed, becomeDriver }, kind, o
   }
 }
 
+/** Return the title of a kind of job, which is that of its form. */
+export const titleOf = ({ forms }, kind) => forms?.find((form) => form.kind === kind)?.title ?? kind;
+
 /** Return the half-width of a thrust's interval, with the calibration where that is known. */
 export const halfWidthOf = ({ thrust_ci95: statistical, total_ci95: total }) => total ?? statistical;
 
@@ -175,7 +178,7 @@ function Job({ job, state, notice, mayDrive, resume }) {
     return () => clearInterval(timer);
   }, [runs]);
   const elapsed = job.elapsed + (runs ? secondsSinceReceived(job) : 0);
-  const [, left] = shareOf(job, elapsed), { estimates, doing } = job.progress ?? {}, title = state.forms?.find(({ kind }) => kind === job.kind)?.title ?? job.kind;
+  const [, left] = shareOf(job, elapsed), { estimates, doing } = job.progress ?? {}, title = titleOf(state, job.kind);
   const isDone = job.state === "done", hasAnswer = isDone && estimates?.length > 0 && job.kind !== "measure";
   const ask = (what) => () => call("POST", `/api/jobs/${job.id}/${what}`).catch((error) => notice("error", error.message, error.remedy));
   return html`<li class=${`job ${job.state}`}>

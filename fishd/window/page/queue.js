@@ -2,6 +2,7 @@
 import { call, duration, html, numberIn, quote, sentence, useEffect, useState } from "./common.js";
 import { startJob } from "./experiments.js";
 import { Text } from "./fields.js";
+import { Growing, Progress } from "./progress.js";
 import { CHECK_TIMEOUT_MS } from "./forms.js";
 
 const POLL_MS = 2000;
@@ -71,6 +72,7 @@ export function Queue({ page }) {
   if (!queue?.items) return html`<h3 class="queue-title">Queue</h3><p class="muted">${queue ? sentence(queue.failure) : "Loading …"}</p>`;
   const mayDrive = state.session?.scope === "drive", isRunning = queue.state === "running";
   const passed = isRunning && queue.current !== null ? (performance.now() - queue.received) / 1000 : 0;
+  const job = [...state.jobs.values()].find(({ kind, fish, state: at }) => kind === "queue" && fish === state.name && at === "running");
   const left = Math.max(0, queue.left - passed), about = queue.unknown ? "at least" : "about";
   const button = (text, action, kind = "") => html`<button type="button" class=${kind} disabled=${!mayDrive} onClick=${action}>${text}</button>`;
   const send = (op, args) => () => change(page, op, args);
@@ -87,7 +89,7 @@ export function Queue({ page }) {
     ${queue.state === "paused" && queue.reason && html`<p class="note">${sentence(`It pauses: ${queue.reason}`)} What was interrupted is resumed at the next start.</p>`}
     ${queue.items.length === 0 && html`<p class="muted">Empty. Add experiments above; they wait here, also when this page is closed, and run one after another.</p>`}
     <ol aria-label="Experiments in the queue">
-      ${queue.items.map((item, place) => html`<${Item} key=${item.id} ...${{ item, place, queue, mayDrive, passed, send }} />`)}
+      ${queue.items.map((item, place) => html`<${Item} key=${item.id} ...${{ item, place, queue, mayDrive, passed, send, job }} />`)}
     </ol>
     ${(queue.items.length > 0 || isRunning) && html`<div class="buttons">
       ${!isRunning ? button("Start queue", () => startJob(page, "queue", {}), "primary")
@@ -103,7 +105,8 @@ export function Queue({ page }) {
   </section>`;
 }
 
-function Item({ item, place, queue, mayDrive, passed, send }) {
+/** job: the runner that this page knows, with the progress of the experiment that runs */
+function Item({ item, place, queue, mayDrive, passed, send, job }) {
   const runs = item.id === queue.current, number = { number: item.id }, words = item.words.join(" ");
   const elapsed = queue.elapsed + passed, each = item.seconds === null ? "" : duration(item.seconds);
   const waits = item.run ? "interrupted, is resumed" : "waits";
@@ -117,6 +120,7 @@ function Item({ item, place, queue, mayDrive, passed, send }) {
       ${button("↑", "Move up", send("move", { ...number, position: place }), place === 0)}
       ${button("↓", "Move down", send("move", { ...number, position: place + 2 }), place === queue.items.length - 1)}
       ${button("Remove", "Remove", send("remove", number), runs)}</span></div>
-    ${runs && item.seconds !== null && html`<progress max=${item.seconds} value=${Math.min(elapsed, item.seconds)} aria-label=${`Progress of ${words}`}></progress>`}
-    <code tabindex="0" aria-label="Command line">fishctl ${item.words.map(quote).join(" ")}</code></li>`;
+    ${runs && job?.progress ? html`<${Progress} job=${job} />` : runs && item.seconds !== null && html`<progress max=${item.seconds} value=${Math.min(elapsed, item.seconds)} aria-label=${`Progress of ${words}`}></progress>`}
+    <code tabindex="0" aria-label="Command line">fishctl ${item.words.map(quote).join(" ")}</code>
+    ${runs && html`<${Growing} points=${job?.points} />`}</li>`;
 }

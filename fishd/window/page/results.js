@@ -1,5 +1,6 @@
 // Results of runs with their intervals, side by side, and pictures that the server draws.
-import { call, fetchPicture, html, interval, sentence, significant, unitText, useEffect, useState } from "./common.js";
+import { call, fetchPicture, html, interval, sentence, significant, unitText, useEffect, useMemo, useState } from "./common.js";
+import { Rows } from "./rows.js";
 
 /** Quantities of results: title, factor from SI units, and unit. */
 const QUANTITIES = {
@@ -26,13 +27,25 @@ export function useResults(runs) {
   return answer;
 }
 
-/** Runs side by side: a table of their results, and their traces over each other. */
+/** Return the tables of several runs as one, with their common columns and the runs as groups; null without a table. */
+function joinTables(results) {
+  const tables = results.filter(({ labels }) => labels.length > 1);
+  const names = Object.keys(tables[0]?.columns ?? {}).filter((name) => tables.every(({ columns }) => name in columns));
+  if (names.length < 2) return null;
+  const columns = Object.fromEntries(names.map((name) => [name, tables.flatMap((table) => table.columns[name])]));
+  const labels = tables.flatMap(({ name, labels: own }) => own.map((label) => (new Set(own).size > 1 ? `${name}: ${label}` : name)));
+  return { columns, labels, name: "the runs" };
+}
+
+/** Runs side by side: a table of their results, their rows in one chart, and the traces of recordings over each other. */
 export function Comparison({ runs, close }) {
   const [results, failure] = useResults(runs);
+  const joined = useMemo(() => results && joinTables(results), [results]);
   return html`<section class="comparison" aria-label="Comparison">
     <div class="head-row"><h3>Comparison</h3><button type="button" onClick=${close}>Close comparison</button></div>
     ${failure ? html`<p class="note">${sentence(failure)}</p>` : results ? html`<${Results} results=${results} />` : html`<p class="muted">Loading …</p>`}
-    <${Picture} path=${`/api/results.png?${queryOf(runs)}`} title="the runs over each other" /></section>`;
+    ${joined && html`<${Rows} result=${joined} />`}
+    ${results?.some(({ labels }) => labels.length < 2) && html`<${Picture} path=${`/api/results.png?${queryOf(runs)}`} title="the runs over each other" />`}</section>`;
 }
 
 export function Results({ results }) {

@@ -6,7 +6,7 @@ const COLOURS = ["thrust", "phi", "fy", "fin", "alpha", "fx"];
 /** Columns that are drawn in thousandths of their unit. */
 const MILLI = ["thrust", "speed", "power", "thrust_per_watt"];
 
-const titleOf = (name) => (MILLI.includes(name) ? `${name} (× 10⁻³)` : name);
+const titleOf = (name) => (MILLI.includes(name) ? `${name} (× 10⁻³)` : name.replace(/^parameters\./, ""));
 
 export function Rows({ result: { columns, labels, name: run } }) {
   const names = Object.keys(columns).filter((name) => !name.endsWith("_ci95")), node = useRef(null);

@@ -69,7 +69,7 @@ export function Runs(page) {
   const shown = (runs ?? []).filter((run) => hasWords(run, filter.text.trim())
     && (!filter.controller || controllersOf(run, known).includes(filter.controller))
     && timeOf(run) >= Date.now() - 86_400_000 * AGES[filter.age]).sort(ORDERS[filter.order]);
-  const pick = (id) => () => setPicked(picked.includes(id) ? picked.filter((other) => other !== id) : [...picked, id]);
+  const pick = (id) => () => setPicked((before) => (before.includes(id) ? before.filter((other) => other !== id) : [...before, id]));
   const changed = () => setChanges((n) => n + 1);
   const hasFish = (runs ?? []).some(fishOf);
   return html`

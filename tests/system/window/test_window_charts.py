@@ -107,6 +107,8 @@ def test_charts_stand_still_while_ticks_come_until_they_follow_again(
         page.evaluate("import('/app.js').then((app) => { globalThis.charts = app.charts; })")
         page.click("#pause")
         before, ticks = span(page), page.evaluate("charts.ring.latest.seq")
+        ends = "charts.shown.map(({ plot }) => plot.axes[0]._values.at(-1))"
+        wait_until(lambda: "latest" not in page.evaluate(ends))
         pixels = "document.querySelector('.chart canvas').toDataURL()"
         drawn = page.evaluate(pixels)
         wait_until(lambda: page.evaluate("charts.ring.latest.seq") > ticks + 40)

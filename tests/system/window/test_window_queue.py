@@ -107,6 +107,21 @@ async def test_a_queue_that_a_page_starts_goes_on_without_it_and_is_stopped_by_a
     assert daemon.status().mode == "idle"
 
 
+async def test_a_page_gets_progress_and_curve_of_the_experiment_that_runs_in_the_queue(
+    new_window: WindowProcess,
+) -> None:
+    async with Browser(new_window.url) as browser, open_page(browser) as page:
+        for values in ("1,1.5", "2,2.5"):
+            options = {"controller": "square", "parameters": {"frequency": values}}
+            options |= {"on": "simulation", "settle": 1, "periods": 2}
+            await page.post("queue", {"op": "add", "kind": "sweep", "options": options})
+        await page.drive()
+        await page.post("/api/jobs", {"fish": "fish", "kind": "queue"})
+        ended = await end_of_job(page)
+        assert [point["x"] for point in ended["points"]] == [2.0, 2.5]
+        assert ended["progress"]["fraction"] == 1.0
+
+
 async def test_an_emergency_stop_of_a_page_pauses_the_queue(
     new_window: WindowProcess, daemon: Daemon
 ) -> None:

@@ -47,6 +47,12 @@ def test_a_field_has_kind_bounds_default_and_help_of_its_option() -> None:
     assert all(field.description for form in forms().values() for field in form.fields)
 
 
+def test_the_help_of_a_field_speaks_of_no_command_line() -> None:
+    helps = [field.description for form in forms().values() for field in form.fields]
+    helps += [form.about for form in forms().values()]
+    assert [text for text in helps if "--" in text or "Ctrl-C" in text] == []
+
+
 @pytest.mark.parametrize(
     ("run", "is_valid"),
     [("größer 2.mcap", True), ("-x", False), ("../x", False), ("~x", False), ("x\n", False)],
