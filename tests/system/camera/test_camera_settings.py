@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import msgspec
 import pytest
 import yaml
 from rigs.camera_process import COMMAND
@@ -11,7 +10,6 @@ from rigs.processes import call, one_line
 
 from fishd.camera import main
 from fishd.camera.settings import CameraSettings, SimulatedSettings, hide_secrets, load
-from fishd.camera.simulated import WEB
 from fishd.core.errors import ConfigError
 
 
@@ -21,13 +19,10 @@ def test_the_examples_are_valid(name: str) -> None:
     assert settings.source == ("v4l2" if name == "camera.yaml" else "simulated")
 
 
-def test_the_good_simulated_camera_is_the_default_and_the_bad_one_the_rig_web() -> None:
+def test_the_good_simulated_camera_is_the_default() -> None:
     assert load(ROOT / "config/camera-simulated.yaml") == CameraSettings()
     good = yaml.safe_load((ROOT / "config/camera-simulated.yaml").read_text())["simulated"]
     assert set(good) == set(SimulatedSettings.__struct_fields__)
-    web = load(ROOT / "config/camera-web.yaml").simulated
-    whole = {"fishd": None, "width": 640, "height": 480}
-    assert msgspec.structs.asdict(web) == msgspec.structs.asdict(WEB) | whole
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 pytest.importorskip("stable_baselines3", reason="install the extra 'learn'")
 
+from rigs.pictures import WEB
+
 from fishd.camera.axis import NoMotion
-from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings
+from fishd.camera.simulated import DEFAULT, SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.camera_frames import Stack, StackSettings
 from fishd.learning.env.environment import SwimEnv

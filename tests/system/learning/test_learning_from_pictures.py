@@ -11,10 +11,11 @@ import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from rigs.pictures import WEB
 from rigs.swimming import brief_job, rows
 
 from fishd.camera.axis import NoMotion
-from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings
+from fishd.camera.simulated import DEFAULT, SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.camera_frames import StackSettings
 from fishd.learning.env import environment

@@ -118,7 +118,8 @@ async def test_a_page_gets_progress_and_curve_of_the_experiment_that_runs_in_the
         await page.drive()
         await page.post("/api/jobs", {"fish": "fish", "kind": "queue"})
         ended = await end_of_job(page)
-        assert [point["x"] for point in ended["points"]] == [2.0, 2.5]
+        # The points of a sweep in simulation are computed side by side, and end in any order.
+        assert sorted(point["x"] for point in ended["points"]) == [2.0, 2.5]
         assert ended["progress"]["fraction"] == 1.0
 
 
