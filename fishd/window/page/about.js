@@ -73,7 +73,7 @@ function Configuration({ keys }) {
   const [all, setAll] = useState(false);
   const own = keys.filter(({ differs }) => differs), shown = all ? keys : own;
   return html`<label class="special"><input type="checkbox" checked=${all} onChange=${(event) => setAll(event.target.checked)} />
-      show all ${keys.length} keys, not only the ${own.length} that differ from the defaults</label>
+      show all ${keys.length} keys, not only those (${own.length}) that differ from the defaults</label>
     ${shown.length > 0 && html`<${Table} label="Configuration" head=${["key", "value", "default"]} rows=${shown.map(({ key, value, default: standard, differs }) => [
       html`<${differs ? "b" : "span"}>${key.split(".").map((part, index) => [index > 0 && html`.<wbr />`, part])}<//>`, valueText(value), differs ? valueText(standard) : ""])} />`}`;
 }
