@@ -71,7 +71,7 @@ class Measuring:
         self._learning_ends = 0.0
         self._is_finishing = self._is_stopping = False
         self.learned: Learned | None = None
-        """What was learned of the tail; None if nothing was."""
+        """Learned tail; None before a tail is learned."""
         self.lens: Lens | None = None
         """Calibration of the lens; None without one."""
         self._lens_problem = ""
@@ -108,7 +108,7 @@ class Measuring:
 
     @property
     def problem(self) -> str:
-        """Why the latest learning failed, or why there are no fin angles; else empty."""
+        """Reason why the latest learning failed, or no fin angle is known; empty without one."""
         return self._learning_problem or self._measuring_problem
 
     def offer(self, session: str, seq: int, moment: float, pixels: Pixels) -> None:

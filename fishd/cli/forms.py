@@ -67,11 +67,12 @@ def describe_forms() -> list[Form]:
 
 def _describe(root: click.Group, kind: str, source: _Source) -> Form:
     words = (source.words or kind).split()
-    context, command = click.Context(root), root
+    context = click.Context(root)
+    command: click.Command | None = root
     for word in words:
-        verb = command.get_command(context, word)
-        assert verb
-        command = verb  # type: ignore[assignment]
+        assert isinstance(command, click.Group)
+        command = command.get_command(context, word)
+    assert command
     values: Any = ""
     params: Sequence[click.Parameter] = command.params
     if isinstance(command, ControllerGroup):

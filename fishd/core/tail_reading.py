@@ -15,7 +15,7 @@ MIDLINE_POINTS = 16
 
 
 class TailReading(Struct, frozen=True, kw_only=True):
-    """What one picture shows of the tail.
+    """Fin angle and midline in one picture, or the reason why the angle is unknown.
 
     `alpha` is the direction of the straight part of the fin against the fish's axis. It is positive
     where the tail is bent towards the higher rows, which is downwards with the head at the left.

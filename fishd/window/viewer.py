@@ -21,7 +21,7 @@ class Viewer:
     OPCODE = WSMsgType.BINARY
     """Kind of the messages that are bytes."""
     kind = "page"
-    """What it is; those of each kind are counted apart."""
+    """Kind of viewer; each kind has a largest number of its own."""
     address = ""
     """Address of the page."""
     device_id = ""
