@@ -235,7 +235,7 @@ class EarlyFits:
             self._process = None
 
     def event(self, _: Event) -> None:
-        pass
+        """Ignore an event."""
 
     def close(self) -> None:
         """End the fit that goes on."""
