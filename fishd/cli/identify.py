@@ -231,7 +231,8 @@ class EarlyFits:
         elif self._process and self._process.poll() is not None:
             output, _errors = self._process.communicate()
             if self._process.returncode == 0:
-                self._show_result(json.loads(output))
+                with suppress(json.JSONDecodeError):  # where a package prints, too
+                    self._show_result(json.loads(output))
             self._process = None
 
     def event(self, _: Event) -> None:
