@@ -107,7 +107,7 @@ class JobRequests:
             message = f"no such kind '{text.quoted(body.kind)}'; valid: {', '.join(forms)}, resume"
             raise ApiError(400, "unknown-kind", message)
         form, kind = forms[body.kind]
-        options = convert(body.options, kind, f"{body.kind}: ")
+        options: Any = convert(body.options, kind, f"{body.kind}: ")
         if body.kind == "record" and not options.subject:
             options.subject = self._pages.names.get(link.endpoint)
         if getattr(options, "parameters", None):

@@ -32,5 +32,5 @@ function Emptying({ count, page, changed, isOff }) {
     call("POST", "/api/trash/empty", {}, CHECK_TIMEOUT_MS).catch((error) => page.notice("error", error.message, error.remedy)).then(changed);
   };
   return html`<div class="buttons"><button type="button" disabled=${isOff} onClick=${() => setAsking(!isAsking)}>${isAsking ? "Keep" : "Empty trash"}</button>
-    ${isAsking && html`<button type="button" class="stop" onClick=${empty}>Remove ${count === 1 ? "this run" : `these ${count} runs`} for ever</button>`}</div>`;
+    ${isAsking && html`<button type="button" class="stop" onClick=${empty}>Remove ${count === 1 ? "this run" : `these ${count} runs`} permanently</button>`}</div>`;
 }

@@ -616,7 +616,7 @@ def test_runs_are_found_compared_noted_renamed_and_deleted_with_undo(
         page.get_by_role("button", name="Empty trash").dblclick()  # does not remove anything
         expect(page.locator(".trash li")).to_contain_text("third")
         page.get_by_role("button", name="Empty trash").click()
-        page.get_by_role("button", name="Remove this run for ever").click()
+        page.get_by_role("button", name="Remove this run permanently").click()
         expect(page.locator(".trash")).to_contain_text("It is empty")
         assert [line for line in complaints if "409" not in line] == []
 

@@ -16,14 +16,15 @@ from fishd.lab.experiment import Header, open_experiment
 
 pytestmark = needs_browser
 
-DRAWS_FOR_EVER = """
+NEVER_DRAWS = """
 import asyncio
-from fishd.window import runs
+from fishd.window import downloads, runs
+downloads.STALL_TIMEOUT_S = 1e4
 async def call(words, folder):
     await asyncio.Event().wait()
 runs.call = call
 """
-"""Code of a window whose pictures are never complete."""
+"""Code of a window whose pictures are never complete, and that waits for a slow browser."""
 DOWNLOAD_BYTES = 100 * 2**20
 
 
@@ -35,14 +36,14 @@ def browser() -> Iterator[None]:
 
 @pytest.fixture
 def drawing_window(daemon: Daemon, tmp_path: Path) -> Iterator[WindowProcess]:
-    """Yield a window with an experiment and a large file of a recording, that draws for ever."""
+    """Yield a window with an experiment and a large recording, whose pictures never end."""
     folder = tmp_path / "runs"
     folder.mkdir()
     with open_experiment(folder / "swept", Header(kind="sweep", on="simulation")) as experiment:
         experiment.open_table(["frequency", "thrust"]).add({"frequency": 1.5, "thrust": 0.02})
     with (folder / "large.mcap").open("wb") as file:
         file.truncate(DOWNLOAD_BYTES)
-    with running_window(tmp_path, fish=daemon.endpoint, changes=DRAWS_FOR_EVER) as window:
+    with running_window(tmp_path, fish=daemon.endpoint, changes=NEVER_DRAWS) as window:
         yield window
 
 
