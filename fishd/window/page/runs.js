@@ -60,7 +60,7 @@ export function Runs(page) {
   }).catch(setFailure);
   useEffect(() => {
     if (isShown) load();
-  }, [finished, changes, isShown]);
+  }, [finished, changes, isShown, state.linked]);
   const known = state.controllers.map(({ name }) => name);
   const controllers = [...new Set((runs ?? []).flatMap((run) => controllersOf(run, known)))].sort();
   const set = (name) => (event) => {

@@ -465,6 +465,8 @@ def test_a_form_says_at_once_what_its_job_would_refuse(new_window: WindowProcess
         seconds.fill("20")
         expect(page.locator("#preview")).to_contain_text("20.25 to 3600 s are needed")
         expect(start).to_be_disabled()
+        seconds.fill("30 s")
+        expect(page.locator("#preview")).to_contain_text("seconds: '30 s' is not valid: a number")
         seconds.fill("21")
         expect(page.locator("#preview")).to_contain_text("fishctl measure swing --for 21")
         expect(start).to_be_enabled()
