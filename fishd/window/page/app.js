@@ -363,7 +363,7 @@ function Head() {
   const driver = lease ? `${lease.name} drives` : state.driver ? (state.driver.you_drive ? "you drive" : `${driverName(state)} drives`) : "no driver";
   return html`
     ${state.fish.length > 1
-      ? html`<nav class="tabs" aria-label="Fish"><h1 class="unseen">${state.name}</h1>${state.fish.map((name) => html`<a href=${`?fish=${encodeURIComponent(name)}`}
+      ? html`<nav class="tabs" aria-label="Fish"><h1 class="unseen">${state.name}</h1>${state.fish.map((name) => html`<a href=${`?fish=${encodeURIComponent(name)}#${state.place}`}
           aria-current=${name === state.name ? "page" : undefined}>${name}</a>`)}</nav>`
       : html`<h1>${shownName() || "fishd"}</h1>`}
     ${kind !== "not paired" && html`<span class=${`pill mode ${mode}`} id="mode">${kind === "lost" && state.status ? `was ${modeText}` : modeText}</span>`}
