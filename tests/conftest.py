@@ -53,6 +53,10 @@ LONG_MODULES = {
     "test_measure",
     "test_reliability",
     "test_doctor_bench",
+    "test_window_hour",
+    "test_cluster",
+    "test_seeds",
+    "test_step_response",
 }
 """Modules with a test that takes longer than ten others; these begin first."""
 
