@@ -48,15 +48,9 @@ settings.load_profile("fishd")
 UNIT = Path(__file__).parent / "unit"
 SERVICE_SOCKET = Path("/run/fishd/control")
 LONG_MODULES = {
-    "test_unknown_keys",
-    "test_site",
-    "test_measure",
-    "test_reliability",
-    "test_doctor_bench",
-    "test_window_hour",
-    "test_cluster",
-    "test_seeds",
-    "test_step_response",
+    *("test_unknown_keys", "test_site", "test_measure", "test_reliability", "test_doctor_bench"),
+    *("test_window_hour", "test_measured_tail", "test_half_open", "test_socket_files"),
+    *("test_estop", "test_cluster", "test_seeds", "test_step_response"),
 }
 """Modules with a test that takes longer than ten others; these begin first."""
 
