@@ -65,7 +65,7 @@ _KNOCK_RAD = 0.012
 _MEAN_TURN = 0.5
 """The same, relative to the turn that 95 % of single learned pictures stay below."""
 _MOVED_S = 0.3
-"""Time for which the angle stays unknown after a picture that shows a move of the camera, as waves
+"""Time for which the angle stays unknown after pictures that show a move of the camera, as waves
 hide it from others [s]."""
 _MIN_KNOCK_READINGS, _MIN_DOUBT_READINGS = 5, 2
 _MIN_SIDE_READINGS = 6
@@ -158,6 +158,7 @@ class TailMeter:
         self._zero_moved = ""
         self._moved = -math.inf, ""
         """Time of the latest picture that shows a move of the camera, and its reason."""
+        self._moved_until = -math.inf
         self._small: Pixels | None = None
         """Previous picture, shrunk."""
         self._last: tuple[float, float] | None = None
@@ -285,6 +286,8 @@ class TailMeter:
         if side := cut_off_side(places, self.learned.size):
             return _leaves(side)
         if moved := moved or self._watch_scene(place is not None, small, light, time):
+            if 0.0 <= time - self._moved[0] <= _DOUBT_S:  # one picture alone may be wrong
+                self._moved_until = time + _MOVED_S
             self._moved = time, moved
             return moved
         if place is not None:
@@ -307,7 +310,7 @@ class TailMeter:
             limit = _JUMP_RAD + _JUMP_RATE * self.learned.top_rate * (time - before)
             if 0.0 < time - before < _JUMP_S and abs(seen.alpha - angle) > limit:
                 return "the fin jumped, or something else looks like it"
-        return self._moved[1] if 0.0 <= time - self._moved[0] < _MOVED_S else ""
+        return self._moved[1] if self._moved[0] <= time < self._moved_until else ""
 
     def _watch_zero(self, seen: _Seen | None, time: float) -> str:
         """Return by how much the zero has moved, if it has."""
