@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import os
 import re
 import signal
 from collections.abc import Iterator
@@ -13,10 +14,10 @@ from playwright.sync_api import APIResponse, Page, Route, expect
 from rigs.browser import needs_browser, open_page, shared_browser
 from rigs.camera_process import running_camera
 from rigs.live_page import RESOLVED, go, live_page, name_device, swim
-from rigs.processes import Daemon, running, wait_until
+from rigs.processes import PATIENCE, Daemon, running, wait_until
 from rigs.recordings import record_run, swum
 from rigs.virtual_pi_process import Pi
-from rigs.window_process import WindowProcess
+from rigs.window_process import WindowProcess, running_window
 
 from fishd.lab.experiment import Header, open_experiment
 
@@ -392,6 +393,23 @@ def test_the_part_fish_shows_computer_settings_log_and_checks(window: WindowProc
         expect(page.locator("#log")).to_contain_text("not the service of this computer")
         page.click("#checks button")
         expect(page.locator("#checks")).to_contain_text("daemon")
+        assert complaints == []
+
+
+def test_a_service_that_rests_is_restarted_from_the_page(service: Daemon, tmp_path: Path) -> None:
+    is_service = "from fishd.window import inspection; inspection._is_service = lambda link: True"
+    with (
+        running_window(tmp_path, changes=is_service, fish=service.endpoint) as window,
+        live_page(window.url) as (page, complaints),
+    ):
+        swim(page)
+        go(page, "fish")
+        restart = page.get_by_role("button", name="Restart fishd")
+        expect(restart).to_be_disabled()
+        service.at_rest()
+        restart.click()
+        assert service.process.wait(PATIENCE) == os.EX_TEMPFAIL
+        expect(page.locator("#connection")).to_contain_text("lost")
         assert complaints == []
 
 
