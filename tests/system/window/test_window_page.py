@@ -652,7 +652,7 @@ def test_an_opened_run_a_comparison_and_the_trash_fit_each_screen_and_have_no_ba
         page.get_by_role("button", name="Compare 3").click()
         page.get_by_role("button", name="Open swept").click()
         page.get_by_role("button", name="Trash").click()
-        expect(page.locator(".rows canvas")).to_be_visible()
+        expect(page.locator(".rows canvas")).to_have_count(2)  # of the comparison and of the run
         expect(page.locator(".comparison tbody tr")).to_have_count(2)
         expect(page.locator(".comparison img")).to_be_visible()
         expect(page.locator(".note")).to_have_count(1)  # the sweep has no recording to draw
