@@ -20,6 +20,7 @@ def runner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> QueueRunner:
     return QueueRunner(file)
 
 
+@pytest.mark.slow
 def test_a_stop_while_a_run_is_starting_is_not_its_failure(
     runner: QueueRunner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -34,6 +35,7 @@ def test_a_stop_while_a_run_is_starting_is_not_its_failure(
     assert [past.outcome for past in queue.past] == ["stopped"]
 
 
+@pytest.mark.slow
 def test_a_terminal_that_is_gone_does_not_end_the_queue(
     runner: QueueRunner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
