@@ -297,6 +297,17 @@ def test_rows_from_other_options_are_not_mixed(
     assert "is from another video or other options: remove it" in one_line(done)
 
 
+def test_a_figure_that_cannot_be_written_costs_no_measurement(
+    video: Path, measured: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target, learned = tmp_path / "fish.csv", ("--learned", measured[2] / "fish.bin")
+    done = measure(video, target, "--plot", "/proc/fish.png", *learned)
+    assert "/proc/fish.png: the figure cannot be written" in one_line(done)
+    monkeypatch.setattr(VideoTable, "add", None)
+    assert measure(video, target, *learned).returncode == 0
+    assert pandas.read_csv(target).fin_angle.equals(measured[0].fin_angle)
+
+
 def test_a_recording_of_another_swim_costs_no_measurement(
     video: Path, measured: Result, tmp_path: Path
 ) -> None:
