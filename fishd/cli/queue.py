@@ -19,8 +19,10 @@ from fishd.core.experiment_queue import MAX_ITEMS, MAX_REPEAT, QueueFile, View
 from fishd.core.experiments import Plan
 from fishd.recording.folder import runs_folder
 
-EXPERIMENTS = ("measure", "sweep", "compare", "optimise", "identify", "adapt", "learn")
-"""Verbs that a queue takes."""
+EXPERIMENTS = (
+    "measure", "sweep", "compare", "optimise", "identify --experiment", "adapt", "learn ppo",
+)  # fmt: skip
+"""Verbs that a queue takes, with the words that make each an experiment."""
 MAX_CLOCK_S = 3e7
 """Longest duration of a queue for which the time of its end is shown [s]."""
 _CHOSEN_OPTIONS = {
@@ -69,9 +71,11 @@ def add(
     For example: fishctl queue add measure swing --for 60 --repeat 3. The words are checked now, as
     their verb does before the fish swims.
     """
-    if words[0] not in EXPERIMENTS:
-        known = ", ".join(EXPERIMENTS)
-        raise click.UsageError(f"'{words[0]}' is not an experiment; a queue takes: {known}")
+    taken = map(str.split, EXPERIMENTS)
+    if not any(words[0] == verb and {*needed} <= {*words} for verb, *needed in taken):
+        raise click.UsageError(
+            f"'{shlex.join(words)}' is not an experiment; a queue takes: {', '.join(EXPERIMENTS)}"
+        )
     for word in words:
         if word.partition("=")[0] in _CHOSEN_OPTIONS:
             raise click.UsageError(f"{word.partition('=')[0]} is chosen by the queue; leave it out")
