@@ -202,6 +202,11 @@ def test_a_video_with_the_head_at_the_right_is_turned(tmp_path: Path) -> None:
     assert json.loads(done.stdout)["fin_angle_max"] == pytest.approx(0.2, rel=0.01)
 
 
+def test_the_tail_is_learned_from_pictures_of_a_fast_camera(video: Path, tmp_path: Path) -> None:
+    done = measure(video, tmp_path / "fish.csv", "--rate", "5000", "--json")
+    assert json.loads(done.stdout)["known"] > 0.95 * 30 * SECONDS
+
+
 Make = Callable[[Path], Path]
 
 
