@@ -105,6 +105,16 @@ def clear_fault(endpoint: str | None, as_json: bool) -> None:
 
 
 @click.command()
+@daemon_options
+def restart(endpoint: str | None, as_json: bool) -> None:
+    """Have systemd start the daemon again, which reads its configuration anew.
+
+    Refused while the fish swims, and if the configuration is wrong.
+    """
+    _change(endpoint, as_json, client.Fish.restart)
+
+
+@click.command()
 @click.argument("words", metavar="TEXT", type=Utf8Text())
 @daemon_options
 def mark(words: str, endpoint: str | None, as_json: bool) -> None:

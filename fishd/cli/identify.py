@@ -1,6 +1,11 @@
 """The verb `fishctl identify`, which identifies a fish from its forces."""
 
+import json
+import os
 import shlex
+import subprocess
+from collections.abc import Sequence
+from contextlib import ExitStack, closing, suppress
 from copy import deepcopy
 from datetime import datetime
 from math import isfinite
@@ -8,16 +13,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from msgspec.structs import asdict
 
 from fishd.cli.experiment import Resumable, Run, experiment_options
 from fishd.cli.options import FiniteRange, NamesType, for_option
 from fishd.cli.output import echo
-from fishd.cli.progress import show_waiting
+from fishd.cli.progress import Bar, Lines, Reports, show_waiting
 from fishd.cli.recording.files import open_recording
 from fishd.config import Config, ServoSettings, adopt, check_tethered, load
 from fishd.core import files
 from fishd.core.errors import FishdError
-from fishd.core.experiments import Estimate
+from fishd.core.experiments import CurvePoint, Estimate
+from fishd.core.process.fishctl_child import fishctl_command
+from fishd.core.signals import Event, Tick
 from fishd.recording.folder import list_recordings
 from fishd.recording.reader import open_run
 
@@ -25,6 +33,15 @@ if TYPE_CHECKING:
     from fishd.lab.identification import Identification
 
 DEFAULT_EXPERIMENT_S = 180.0
+FIRST_FIT_S = 20.0
+"""Length of the experiment at its first fit while the fish swims [s]."""
+FIT_GROWTH = 1.5
+"""Ratio of the lengths of the experiment at two fits: an interval shrinks by about a fifth."""
+SHOWN = (
+    *("omega0", "xi", "servo_speed", "coupling", "thrust_coefficient"),
+    "thrust_coefficient * coupling^2",
+)
+"""Constants that are shown while the fish swims, if the forces determine them."""
 
 
 @click.command(cls=Resumable)
@@ -107,7 +124,10 @@ def identify(
 
     lab.check(lab.DEFAULT if fit is None else fit, fix)  # before minutes of swimming
     if experiment:
-        config, tables, servo = _swim_experiment(run, seconds or DEFAULT_EXPERIMENT_S)
+        options = [f"--fix={','.join(fix)}"] if fix else []
+        options += [f"--fit={','.join(fit)}"] if fit else []
+        options += ["--tail", f"--tail-scale={tail_scale}"] if run.uses_tail else []
+        config, tables, servo = _swim_experiment(run, seconds or DEFAULT_EXPERIMENT_S, options)
         origin = f"an experiment with {run.fish}"
     else:
         config, servo = load(run.fish.file, run.fish.overrides), None
@@ -147,9 +167,12 @@ def identify(
         draw(identification, run.kept_picture)
 
 
-def _swim_experiment(run: Run, seconds: float) -> "tuple[Config, list[Any], ServoSettings | None]":
+def _swim_experiment(
+    run: Run, seconds: float, options: Sequence[str]
+) -> "tuple[Config, list[Any], ServoSettings | None]":
     """Swim an experiment, or the rest of one that is resumed.
 
+    options: those of the fit, for the fits while the fish swims
     Return the start configuration of the fit, the tables of ticks and the settings of the servo.
     """
     from fishd.lab.identification import continue_experiment
@@ -167,12 +190,90 @@ def _swim_experiment(run: Run, seconds: float) -> "tuple[Config, list[Any], Serv
     if run.is_resumed and fish.on == "live":
         before = [open_run(path).frame() for path in list_recordings(run.folder)]
     tables: list[Any]
-    with run.swimming(seconds, since=sum(map(len, before)) * session.tick, logged=False):
+    since = sum(map(len, before)) * session.tick
+    with run.swimming(seconds, since=since, logged=False) as show, ExitStack() as stack:
+        if fish.on == "live" and isinstance(show, Bar | Reports):
+            fits = EarlyFits(run, config, options, show, since)
+            stack.enter_context(session.heard_by(stack.enter_context(closing(fits))))
         tables = continue_experiment(session, before, seconds)
     run.check("before the fit")
     if run.uses_tail:  # only recordings have each fin angle
         tables = [open_run(path) for path in list_recordings(run.folder)]
     return config, tables, session.servo
+
+
+class EarlyFits:
+    """A listener of a live session that shows constants of the fish while it swims.
+
+    Each fit is `fishctl identify` on the recordings, in a process of low priority. It begins with
+    the values of the fit before it; one that fails shows nothing.
+    """
+
+    def __init__(
+        self, run: Run, config: Config, options: Sequence[str], show: Lines, since: float
+    ) -> None:
+        """config: start of the first fit; since: length of the finished part [s]"""
+        from fishd.lab.identification.estimation import LAW, POSSIBLE
+
+        self._run, self._options, self._show, self._since = run, options, show, since
+        values = asdict(config.plant) | {"rotation": config.simulation.rotation}
+        self._values = {name: values[name] for name in (LAW, *POSSIBLE)}
+        self._due = FIRST_FIT_S
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def tick(self, _: Tick) -> None:
+        """Begin a fit that is due, or show the result of one that has ended."""
+        seconds = self._since + self._run.session().used
+        if self._process is None and seconds >= self._due:
+            self._due = FIT_GROWTH * seconds
+            with suppress(OSError):  # such as a lack of memory
+                self._process = self._start_fit()
+        elif self._process and self._process.poll() is not None:
+            output, _errors = self._process.communicate()
+            if self._process.returncode == 0:
+                with suppress(json.JSONDecodeError):  # where a package prints, too
+                    self._show_result(json.loads(output))
+            self._process = None
+
+    def event(self, _: Event) -> None:
+        """Ignore an event."""
+
+    def close(self) -> None:
+        """End the fit that goes on."""
+        if self._process:
+            self._process.kill()
+            self._process.communicate()
+
+    def _start_fit(self) -> "subprocess.Popen[bytes]":
+        section = {"rotation": "simulation"}
+        start = [f"--set={section.get(n, 'plant')}.{n}={v}" for n, v in self._values.items()]
+        paths = map(str, list_recordings(self._run.folder))
+        return subprocess.Popen(
+            fishctl_command(["identify", "--json", *self._options, *start, "--", *paths]),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=os.environ | {"OMP_NUM_THREADS": "1"},  # more only double the load
+        )
+
+    def _show_result(self, result: dict[str, Any]) -> None:
+        """Show a fit, and begin the next one with its values."""
+        if not result["identified"]:
+            return
+        fitted = result["estimates"]
+        self._values |= {name: fitted[name]["value"] for name in self._values if name in fitted}
+        self._values["servo_law"] = result["servo_law"]
+        fitted |= result["products"]
+        known = [
+            (name, values["value"], values["ci95_low"], values["ci95_high"], values["unit"])
+            for name in SHOWN
+            if "if_ratio_holds" not in (values := fitted[name])
+            and values["ci95_low"] < values["ci95_high"]
+        ]
+        if known:
+            name, value, low, high, unit = known[0]
+            point = CurvePoint(result["seconds"], value, (high - low) / 2, "time [s]", name, unit)
+            self._show.estimate([Estimate(*values) for values in known], point)
 
 
 def _write_config(target: Path, text: str) -> None:

@@ -25,6 +25,7 @@ VERBS = {
         "stop": Verb("control", "stop", "Fade to neutral and stay there."),
         "estop": Verb("estop", "estop", "Emergency stop: no more pulses, at once."),
         "clear-fault": Verb("control", "clear_fault", "Leave mode fault or estop."),
+        "restart": Verb("control", "restart", "Start the service again, with its configuration."),
         "release": Verb(
             "release", "release", "Last resort without the daemon: neutral, then no pulses."
         ),

@@ -17,6 +17,7 @@ from fishd.core.experiments import PROGRESS_VARIABLE, CurvePoint, Estimate, Prog
 from fishd.core.process.interruption import defer_signals
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
     from rich.live import Live
     from rich.progress import Progress as RichProgress
     from rich.progress import TaskID
@@ -65,12 +66,12 @@ class Bar(Lines):
         self.at(amount)
 
     def at(self, amount: float, latest_result: str | None = None) -> None:
-        """Move the bar; the latest result stands to its right."""
+        """Move the bar; the latest result stands below it."""
         description = None if latest_result is None else text.line(latest_result)
         self._progress.update(self._task, completed=amount, description=description)
 
     def estimate(self, estimates: Sequence[Estimate], point: CurvePoint | None = None) -> None:
-        """Show the values to the right of the bar."""
+        """Show the values below the bar."""
         description = ", ".join(map(format_estimate, estimates))
         self._progress.update(self._task, description=text.line(description))
 
@@ -168,6 +169,15 @@ def show_progress(total: float, unit: str, *, err: bool = False) -> Iterator[Lin
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
+    from rich.text import Text
+
+    class ProgressWithResult(Progress):
+        """A bar with the latest result below it, which has no room beside it."""
+
+        def get_renderables(self) -> Iterator["RenderableType"]:
+            yield from super().get_renderables()
+            if self.tasks and self.tasks[0].description:
+                yield Text(self.tasks[0].description)
 
     columns = (
         TextColumn("{task.completed:.0f} of {task.total:.0f} " + unit),
@@ -176,11 +186,10 @@ def show_progress(total: float, unit: str, *, err: bool = False) -> Iterator[Lin
         TextColumn("passed,"),
         TimeRemainingColumn(),
         TextColumn("left"),
-        TextColumn("{task.description}", markup=False),
     )
     # Output that other code prints meanwhile must not be redirected.
     console = Console(stderr=True)
-    with Progress(*columns, console=console, redirect_stdout=False) as progress:
+    with ProgressWithResult(*columns, console=console, redirect_stdout=False) as progress:
         yield Bar(progress, progress.add_task("", total=total), err)
 
 

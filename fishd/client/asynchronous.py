@@ -91,6 +91,7 @@ class AsyncFish:
     set_parameters = _run_in_thread(Fish.set_parameters)
     stop = _run_in_thread(Fish.stop)
     clear_fault = _run_in_thread(Fish.clear_fault)
+    restart = _run_in_thread(Fish.restart)
     mark = _run_in_thread(Fish.mark)
     calibrations = _run_in_thread(Fish.calibrations)
     sample_force = _run_in_thread(Fish.sample_force)

@@ -161,6 +161,10 @@ class Fish(Connection):
         """Leave mode fault or estop."""
         return self._call(State, "clear-fault")
 
+    def restart(self) -> State:
+        """Have systemd start fishd again, which reads its configuration anew; raise `Refused`."""
+        return self._call(State, "restart", patience=LOADING_TIMEOUT_S)
+
     def mark(self, text: str) -> State:
         """Publish a mark in the event stream, such as a note on a change of the rig."""
         return self._call(State, "mark", text=text)

@@ -266,6 +266,12 @@ OPERATIONS = {
     "clear-fault": Operation(
         NoArguments, _STATE, "leaves mode fault or estop for idle. Otherwise: nothing"
     ),
+    "restart": Operation(
+        NoArguments,
+        _STATE,
+        "fades to neutral and ends; systemd starts `fishd` again. Refused while a controller runs, "
+        "in mode estop, without systemd, or if the configuration is wrong now",
+    ),
     "take-lease": Operation(
         TakeLease,
         "[lease](#leases)",

@@ -6,8 +6,10 @@ import itertools
 import logging
 import math
 import os
+import signal
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
@@ -33,7 +35,7 @@ from fishd.daemon.calibration_requests import CalibrationRequests
 from fishd.daemon.control_server import ControlServer
 from fishd.daemon.direct_sockets import open_at_file, open_in_kernel
 from fishd.daemon.gateway.gateways import Gateways, Telemetry
-from fishd.daemon.requests import Access, Operations
+from fishd.daemon.requests import Access, Operations, Restart
 from fishd.daemon.socket_files import SocketWatch
 from fishd.daemon.virtual_pace import Lockstep, SlowMotion
 from fishd.hardware.base import Robot
@@ -56,9 +58,21 @@ class Daemon:
     if another step fails.
     """
 
-    def __init__(self, config: Config, print_status: bool, file: Path | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        print_status: bool,
+        file: Path | None = None,
+        overrides: Sequence[str] = (),
+    ) -> None:
+        """
+        file, overrides: what the configuration was read from
+        """
         self._config = config
         self._file = file
+        self._read_config = partial(load, file, overrides)
+        self.restarts = False
+        """Whether systemd shall start fishd again when it has ended."""
         self._print_status = print_status
         self._slow: SlowMotion | None = None
         if not config.kind.is_real_time:
@@ -117,6 +131,9 @@ class Daemon:
                 controllers,
                 self.is_realtime,
                 self._access,
+                Restart(self._read_config, self._end_for_restart)
+                if self._notifier.is_service
+                else None,
             )
             self._server = ControlServer(self._operations.perform, config.tick)
             self._gateways.serve(self._server, self._loop.reporter)
@@ -197,6 +214,11 @@ class Daemon:
                 self._server.end_tick()
         finally:
             ticker.close()
+
+    def _end_for_restart(self) -> None:
+        log.info("a restart was requested")
+        self.restarts = True
+        signal.raise_signal(signal.SIGTERM)  # the way of each end, also of a loop that hangs
 
     def _between_ticks(self) -> None:
         """Do housekeeping, one job at a time, so that it fits between two ticks of 2 ms."""
@@ -281,22 +303,28 @@ def _with_slow_motion(robot: Robot, slow: SlowMotion) -> Robot:
 
 
 async def swim(
-    config: Config, print_status: bool, shutdown: Shutdown, file: Path | None = None
-) -> None:
+    config: Config,
+    print_status: bool,
+    shutdown: Shutdown,
+    file: Path | None = None,
+    overrides: Sequence[str] = (),
+) -> bool:
     """Run a daemon until a signal, which may also come before the servo is driven.
 
-    file: file of the configuration
+    file, overrides: what the configuration was read from
+    Return whether systemd shall start it again.
     """
     stopping = asyncio.Event()
     events = asyncio.get_running_loop()
     shutdown.call_when_requested(partial(events.call_soon_threadsafe, stopping.set))
-    with Daemon(config, print_status, file) as daemon:
+    with Daemon(config, print_status, file, overrides) as daemon:
         shutdown.release = daemon.release_at_once
         if daemon.is_realtime:
             shutdown.raise_priority(config.realtime.priority)
         await asyncio.sleep(0)  # lets an earlier signal set `stopping`
         if not stopping.is_set():
             await daemon.run(stopping)
+    return daemon.restarts
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
@@ -325,8 +353,8 @@ def fishd(
 ) -> int:
     """Run the robotic fish until SIGINT (Ctrl-C), SIGTERM or SIGHUP.
 
-    Exit status: 0 after a clean stop, 1 when something failed, 2 for a wrong option, 78 when the
-    configuration is wrong.
+    Exit status: 0 after a clean stop, 1 when something failed, 2 for a wrong option, 75 to be
+    started again, 78 when the configuration is wrong.
     """
     config = load(path, overrides)
     logs = LogWriter(log_format)
@@ -334,7 +362,7 @@ def fishd(
     shutdown.last_words = logs.close
     show = bool(sys.stdout and sys.stdout.isatty()) if print_status is None else print_status
     try:
-        asyncio.run(swim(config, show, shutdown, path))
+        restarts = asyncio.run(swim(config, show, shutdown, path, overrides))
     except ConfigError as error:  # in a calibration file
         log.critical("%s", error)
         return os.EX_CONFIG
@@ -349,7 +377,7 @@ def fishd(
             logs.close()
         else:  # fishd has driven nothing, and the log holds only the reason
             logs.close(UNHURRIED_FLUSH_TIMEOUT_S)
-    return 0
+    return os.EX_TEMPFAIL if restarts else 0
 
 
 def main() -> None:

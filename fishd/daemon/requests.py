@@ -20,7 +20,7 @@ from fishd.controllers.base import Controller, Limits
 from fishd.controllers.policy import library
 from fishd.core import protocol, text
 from fishd.core.clock import Clock, SlowClock, read_boot_id
-from fishd.core.errors import ParameterError, Refused, UnknownController
+from fishd.core.errors import ConfigError, ParameterError, Refused, UnknownController
 from fishd.core.foreign_code import call_foreign
 from fishd.core.protocol import Grant, PolicyInfo, State
 from fishd.core.schema import Problem, convert, fields_of, suggest
@@ -45,6 +45,15 @@ class Access(NamedTuple):
     """Numbers of recovered errors since start."""
 
 
+class Restart(NamedTuple):
+    """How fishd is started again by systemd."""
+
+    read_config: Callable[[], Config]
+    """Function that reads the configuration that it will have; it raises `ConfigError`."""
+    end: Callable[[], None]
+    """Function that lets it end for that."""
+
+
 class Operations:
     """Handlers of the requests, which read the loop's state and change it between its ticks."""
 
@@ -57,6 +66,7 @@ class Operations:
         controllers: list[ControllerInfo],
         realtime: bool,
         access: Callable[[], "Access"] = Access,
+        restart: Restart | None = None,
     ) -> None:
         """Prepare to answer requests.
 
@@ -64,10 +74,12 @@ class Operations:
         controllers: controllers that can be made active
         realtime: whether the loop runs under SCHED_FIFO
         access: function that returns how clients reach this fishd
+        restart: how systemd starts it again; None if it does not
         """
         self._loop = loop
         self._clock = clock
         self._realtime = realtime
+        self._systemd = restart
         self._access = access
         self._calibrations = calibration_requests
         self._config = config
@@ -91,6 +103,7 @@ class Operations:
             "stop": self._stop,
             "estop": self._estop,
             "clear-fault": self._clear_fault,
+            "restart": self._restart,
             "take-lease": self._take_lease,
             "renew-lease": self._renew_lease,
             "end-lease": self._end_lease,
@@ -311,6 +324,36 @@ class Operations:
         self._carried_out = self._next_arrival()
         self._loop.clear_fault()
         return self._state()
+
+    async def _restart(self, _: protocol.NoArguments) -> State:
+        systemd = self._systemd
+        if systemd is None:
+            raise Refused(
+                "no-service",
+                "fishd is no service of systemd, which would start it again: end and start it by "
+                "hand",
+            )
+        self._check_may_end()
+        self._calls.check_busy()
+        try:
+            await self._calls.call("the configuration has not been read", systemd.read_config)
+        except ConfigError as error:
+            raise Refused("bad-configuration", text.error_message(error)) from None
+        self._check_may_end()
+        systemd.end()
+        return self._state()
+
+    def _check_may_end(self) -> None:
+        """Raise `Refused` while a controller runs, and while an E-stop is latched."""
+        loop = self._loop
+        if loop.supervisor.mode is Mode.RUNNING:
+            raise Refused(
+                "running", f"{loop.active.name} drives the fish; first stop it with 'fishctl stop'"
+            )
+        if loop.supervisor.mode is Mode.ESTOP:
+            raise Refused(
+                "estop", "a restart would end the emergency stop; use 'fishctl clear-fault' first"
+            )
 
     async def _mark(self, request: protocol.Mark) -> State:
         self._loop.reporter.event("mark", request.text)

@@ -361,6 +361,8 @@ class FishLink:
         check()
         if op == "clear-fault":
             return _builtins(await fish.clear_fault())
+        if op == "restart":
+            return _builtins(await fish.restart())
         if op == "mark":
             return _builtins(await fish.mark(arguments["text"]))
         for is_last in (False, True):

@@ -61,6 +61,7 @@ OPERATIONS: dict[str, type[Struct]] = {
     "set-parameters": _SetParameters,
     "stop": NoArguments,
     "clear-fault": NoArguments,
+    "restart": NoArguments,
     "mark": _Mark,
     "tare": _Tare,
 }

@@ -141,7 +141,7 @@ class InspectionRequests:
 
 
 def _describe_computer(link: FishLink) -> Row:
-    """Return versions, and how fishd is started again."""
+    """Return versions, and whether systemd starts fishd again."""
     status = link.status
     rows = [("page", f"fishd-window {__version__}"), ("Python", platform.python_version())]
     with suppress(OSError):
@@ -152,7 +152,7 @@ def _describe_computer(link: FishLink) -> Row:
         rows.insert(0, ("fish", f"fishd {status.version}, robot {status.robot}{where}"))
     return {
         "rows": [{"name": name, "value": value} for name, value in rows],
-        "restart": f"sudo systemctl restart {UNIT.removesuffix('.service')}" * _is_service(link),
+        "is_service": _is_service(link),
     }
 
 

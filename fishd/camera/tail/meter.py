@@ -38,13 +38,16 @@ _FOREIGN_LEVEL = 0.5
 _MIN_FIN_SEEN = 0.6
 """Smallest fraction of the fin's stations that must be seen."""
 _MAX_SHAPE_ERROR = 0.004
-"""Permitted distance of a midline from the learned shape, relative to the picture's width."""
+"""Permitted distance of a midline from the learned shape, relative to the picture's width; of
+those just before it, half of it on average."""
+_USUAL_ERROR, _USUAL_RECENT_ERROR = 1.5, 1.0
+"""The same, relative to that of 95 % of the learned pictures, if that is larger."""
 _MIN_DIFFERENCE_RAD, _MAX_DIFFERENCE_RAD = 0.03, 0.045
 """Range of the permitted difference of the fin's direction from that by the learned shape [rad]."""
+_USUAL_DIFFERENCE = 3.0
+"""The same, relative to that of 95 % of the learned pictures."""
 _MAX_TURN_RAD = 0.03
 """Permitted turn of a midline about its root in one picture [rad]."""
-_USUAL = 3.0
-"""Permitted error, relative to that of 95 % of the learned pictures, if that is larger."""
 _WAVE_GAIN, _SHAPE_GAIN = 1.8, 2.0
 """Error of the fin's line by waves, in distances from it relative to its length, and half-width of
 the interval of the shape's angle, in `Fit.alpha_error`."""
@@ -52,14 +55,18 @@ _MIN_WAVE_RAD = 0.006
 """Difference of the line from the shape below which waves do not matter [rad]."""
 _SEEN_TURN = 2.5
 """Factor of the permitted turns of a midline beside edges that show a turn of the camera."""
-_USUAL_TURN = 2.0
-"""Permitted turn, relative to that of 95 % of the learned pictures, if that is larger."""
+_USUAL_TURN, _USUAL_RECENT_TURN = 1.6, 1.0
+"""Permitted turn of a midline, and of those just before it, on average; relative to that of 95 % of
+the learned pictures, if that is larger."""
 _KNOCK_S, _DOUBT_S = 0.8, 0.1
 """Times over which the turn of the midlines is averaged, for the zero and for one picture [s]."""
 _KNOCK_RAD = 0.012
 """Mean turn above which the zero has moved [rad]."""
 _MEAN_TURN = 0.5
 """The same, relative to the turn that 95 % of single learned pictures stay below."""
+_MOVED_S = 0.3
+"""Time for which the angle stays unknown after pictures that show a move of the camera, as waves
+hide it from others [s]."""
 _MIN_KNOCK_READINGS, _MIN_DOUBT_READINGS = 5, 2
 _MIN_SIDE_READINGS = 6
 """Number of readings from which a side of the swing counts for itself."""
@@ -83,6 +90,7 @@ _JUMP_S = 0.2
 """Longest time between two pictures whose change is judged [s]."""
 _SPAN = 1.25
 """Range of angles relative to that learned."""
+_OTHER_SHAPE = "the tail does not have the learned shape"
 _MIN_REPEATED_RATE, _STOP_S = 0.3, 0.15
 """Recent speed of the fin above which two equal pictures are one that the camera repeats [rad/s],
 and the time constant with which it is forgotten, as a fin cannot stop at once [s]."""
@@ -120,12 +128,18 @@ class TailMeter:
         empty = float(np.median(learned.background_picture()[learned.swept_mask()]))
         self._hides_lamps = learned.tail_level > empty or empty >= SATURATED
         width = learned.size[0]
-        self._max_error = max(_MAX_SHAPE_ERROR * width, _USUAL * learned.shape_error)
+        self._max_error = max(_MAX_SHAPE_ERROR * width, _USUAL_ERROR * learned.shape_error)
+        self._max_recent_error = max(
+            0.5 * _MAX_SHAPE_ERROR * width, _USUAL_RECENT_ERROR * learned.shape_error
+        )
         self._max_difference = min(
-            max(_MIN_DIFFERENCE_RAD, _USUAL * learned.direction_error), _MAX_DIFFERENCE_RAD
+            max(_MIN_DIFFERENCE_RAD, _USUAL_DIFFERENCE * learned.direction_error),
+            _MAX_DIFFERENCE_RAD,
         )
         self._turns: deque[tuple[float, float, bool]] = deque()
         """Time, turn, and whether the fin is on the positive side."""
+        self._errors: deque[tuple[float, float]] = deque()
+        """Time and square of the distance from the learned shape [px²]."""
         usual = _SCENE_USUAL * np.array(learned.pose_error)
         shift = _MAX_SHIFT * width
         self._max_pose = np.maximum([shift, shift, _MAX_SCENE_TURN_RAD], usual)
@@ -133,11 +147,18 @@ class TailMeter:
         # Half a pixel looks like a turn; the edges of a body show better whether there was one.
         factor = 1.0 if self._scene.is_blind else _SEEN_TURN
         self._max_turn = max(factor * _MAX_TURN_RAD, _USUAL_TURN * learned.turn_error)
+        self._max_recent_turn = max(
+            factor * _KNOCK_RAD * math.sqrt(_KNOCK_S / _DOUBT_S),
+            _USUAL_RECENT_TURN * learned.turn_error,
+        )
         self._max_mean_turn = max(factor * _KNOCK_RAD, _MEAN_TURN * learned.turn_error)
         self._poses: list[Array] = []
         """Poses of a camera that has moved."""
         self._scene_searched = -math.inf
         self._zero_moved = ""
+        self._moved = -math.inf, ""
+        """Time of the latest picture that shows a move of the camera, and its reason."""
+        self._moved_until = -math.inf
         self._small: Pixels | None = None
         """Previous picture, shrunk."""
         self._last: tuple[float, float] | None = None
@@ -188,13 +209,15 @@ class TailMeter:
         seen = self._look(trace, lag - lag[self._fin].mean(), time)
         reason = self._find_fault(seen, small, light, cover, places, time)
         alpha, uncertainty = None, None
-        if not reason and seen is not None:
+        if seen is not None and (not reason or (reason == _OTHER_SHAPE and self._is_whole(seen))):
             alpha, uncertainty = self._weigh(seen)
             if self._last is not None and time > self._last[0]:
                 span = time - self._last[0]
                 self._rate = (alpha - self._last[1]) / span
                 self._motion = max(abs(self._rate), self._motion * math.exp(-span / _STOP_S))
             self._last = time, alpha
+            if reason:
+                alpha, uncertainty = None, None
         return TailReading(
             time=time,
             alpha=alpha,
@@ -263,13 +286,17 @@ class TailMeter:
         if side := cut_off_side(places, self.learned.size):
             return _leaves(side)
         if moved := moved or self._watch_scene(place is not None, small, light, time):
+            if 0.0 <= time - self._moved[0] <= _DOUBT_S:  # one picture alone may be wrong
+                self._moved_until = time + _MOVED_S
+            self._moved = time, moved
             return moved
         if place is not None:
             return f"something else moves near column {place[0]}, row {place[1]}"
         if seen is None:
             return self._find_lamp(small, places) or "too little of the fin is seen"
         differs = abs(seen.alpha - seen.fit.alpha) > self._max_difference
-        is_other = differs or seen.fit.error > self._max_error or self._is_turned(seen.fit.turn)
+        is_other = differs or self._is_distant(seen.fit.error, time)
+        is_other |= self._is_turned(seen.fit.turn)
         low, high = self._span if not is_other else self.learned.span
         if not low < seen.alpha < high:
             return (
@@ -277,13 +304,13 @@ class TailMeter:
                 "with the waves that are measured"
             )
         if is_other:
-            return self._find_lamp(small, places) or "the tail does not have the learned shape"
+            return self._find_lamp(small, places) or _OTHER_SHAPE
         if self._last is not None:
             before, angle = self._last
             limit = _JUMP_RAD + _JUMP_RATE * self.learned.top_rate * (time - before)
             if 0.0 < time - before < _JUMP_S and abs(seen.alpha - angle) > limit:
                 return "the fin jumped, or something else looks like it"
-        return ""
+        return self._moved[1] if self._moved[0] <= time < self._moved_until else ""
 
     def _watch_zero(self, seen: _Seen | None, time: float) -> str:
         """Return by how much the zero has moved, if it has."""
@@ -291,13 +318,7 @@ class TailMeter:
         if turns and time < turns[-1][0]:
             turns.clear()
             self._zero_moved = ""
-        if (
-            seen is not None
-            and seen.trace.weight.mean() > 0.9
-            and self.learned.span[0] <= seen.alpha <= self.learned.span[1]
-            and seen.fit.error_turned
-            < max(0.5 * _MAX_SHAPE_ERROR * self.learned.size[0], self.learned.shape_error)
-        ):
+        if seen is not None and self._is_whole(seen):
             turns.append((time, seen.fit.turn, seen.alpha > 0.0))
         while turns and time - turns[0][0] > _KNOCK_S:
             turns.popleft()
@@ -310,6 +331,13 @@ class TailMeter:
             self._zero_moved = _zero_moved(turn) if abs(turn) >= self._max_mean_turn else ""
         return self._zero_moved
 
+    def _is_whole(self, seen: _Seen) -> bool:
+        """Return whether the whole tail has the learned shape, perhaps turned."""
+        low, high = self.learned.span
+        limit = max(0.5 * _MAX_SHAPE_ERROR * self.learned.size[0], self.learned.shape_error)
+        is_seen = seen.trace.weight.mean() > 0.9 and low <= seen.alpha <= high
+        return bool(is_seen and seen.fit.error_turned < limit)
+
     def _recent_turns(self, span: float) -> list[tuple[float, bool]]:
         """Return the turns of the latest time [s], and their sides; none if it has gaps."""
         turns = self._turns
@@ -318,12 +346,21 @@ class TailMeter:
             return []
         return [(turn, is_side) for _, turn, is_side in recent]
 
+    def _is_distant(self, error: float, time: float) -> bool:
+        """Return whether a midline is far from the learned shape, or were those just before it."""
+        errors = self._errors
+        errors.append((time, error**2))
+        while not 0.0 <= time - errors[0][0] <= _DOUBT_S:
+            errors.popleft()
+        recent = math.sqrt(np.mean([square for _, square in errors]))
+        is_doubtful = len(errors) >= _MIN_DOUBT_READINGS and recent > self._max_recent_error
+        return error > self._max_error or is_doubtful
+
     def _is_turned(self, turn: float) -> bool:
         """Return whether a midline is turned too much, or were those just before it."""
         recent = [turn for turn, _ in self._recent_turns(_DOUBT_S)]
-        limit = self._max_mean_turn * math.sqrt(_KNOCK_S / _DOUBT_S)
-        is_doubtful = len(recent) >= _MIN_DOUBT_READINGS and abs(np.mean(recent)) > limit
-        return bool(abs(turn) > self._max_turn or is_doubtful)
+        mean = abs(np.mean(recent)) if len(recent) >= _MIN_DOUBT_READINGS else 0.0
+        return bool(abs(turn) > self._max_turn or mean > self._max_recent_turn)
 
     def _watch_scene(self, is_foreign: bool, small: Pixels, light: Floats, time: float) -> str:
         """Return how the camera has moved, if what stands still in the picture has.
@@ -344,10 +381,13 @@ class TailMeter:
                 self._poses.clear()
                 return ""
             self._poses.append(unit * pose)
-        along, down, turn = np.mean(self._poses, axis=0).tolist()
+        mean = np.mean(self._poses, axis=0)
+        turn = float(mean[2])
         if abs(turn) > max(_KNOCK_RAD, self._max_pose[2] / math.sqrt(len(self._poses))):
             return _zero_moved(turn)
-        return f"the camera has moved by {math.hypot(along, down):.0f} px: learn again"
+        part = np.abs(mean[:2]) / self._max_pose[:2]
+        seen = mean[:2] * (part >= 0.5 * part.max())  # not what edges along the rows cannot show
+        return f"the camera has moved by {math.hypot(*seen):.0f} px: learn again"
 
     def _count_foreign(self, small: Pixels) -> int:
         """Return how many pixels that the tail never covers differ from the background."""

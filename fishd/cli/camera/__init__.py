@@ -7,7 +7,7 @@ from fishd.cli.verbs import Verb, Verbs
 VERBS = {
     "Look": {
         "status": Verb("camera.look", "status", "Show the state of the camera."),
-        "view": Verb("camera.look", "view", "Show its picture in the terminal, or write a PNG."),
+        "view": Verb("camera.look", "view", "Write its picture into a PNG file."),
         "measure": Verb("camera.measure", "measure", "Show the fin angle, or learn the tail."),
         "page": Verb("camera.page", "page", "Show its picture on the page of the fish."),
     },

@@ -1,8 +1,6 @@
 """The verb that finds the axis of motion, and how to turn the camera."""
 
 import math
-import os
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,6 +54,7 @@ def align(
     then what a policy learns on one side applies to the other. The picture shows what moves, and
     the axis. Exit status: 0 if an axis was detected, wherever it lies.
     """
+    from fishd.camera import drawing
     from fishd.camera.alignment import judge
     from fishd.camera.axis import find_motion
     from fishd.camera.client import CameraClient
@@ -86,7 +85,11 @@ def align(
         print_json(_to_json(alignment, len(frames)))
     else:
         _print_alignment(alignment, len(frames))
-    _draw_alignment(alignment, png, as_json)
+    if png:
+        energy, axis = motion.energy, motion.axis
+        picture = drawing.enlarge(drawing.draw_motion(energy))
+        drawing.write_png(png, drawing.draw_axis(picture, axis, len(energy)))
+        echo(f"{png}: what moves, and the axis", err=as_json)
     return 0
 
 
@@ -164,20 +167,3 @@ def _to_json(alignment: "Alignment", frames: int) -> dict[str, Any]:
         "advice": alignment.advice,
         "settings": alignment.settings,
     }
-
-
-def _draw_alignment(alignment: "Alignment", png: Path | None, as_json: bool) -> None:
-    from fishd.camera import drawing
-
-    energy, axis = alignment.motion.energy, alignment.motion.axis
-    colours = drawing.draw_axis(drawing.draw_motion(energy), axis, len(energy))
-    if png:
-        large = drawing.enlarge(drawing.draw_motion(energy))
-        drawing.write_png(png, drawing.draw_axis(large, axis, len(energy)))
-        echo(f"{png}: what moves, and the axis", err=as_json)
-    if not as_json and sys.stdout.isatty() and os.environ.get("TERM") not in ("dumb", "unknown"):
-        from rich.console import Console
-
-        from fishd.cli.camera.terminal import TerminalPicture
-
-        Console().print(TerminalPicture(colours))

@@ -11,7 +11,6 @@ VERBS = {
         "evaluate": Verb(
             "learn.evaluate", "evaluate", "Let a policy or controller swim many other fish."
         ),
-        "look": Verb("learn.look", "look", "Show what a policy that sees pictures looks at."),
     }
 }
 

@@ -1,7 +1,7 @@
 """The verbs `fishctl swimmer wake` and `fishctl swimmer midlines`, which draw pictures."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -9,9 +9,6 @@ from fishd.cli.options import F, FiniteRange, json_option, plot_option
 from fishd.cli.output import echo, format_count, print_json, print_paths
 from fishd.core import text
 from fishd.recording.folder import check_new_files
-
-if TYPE_CHECKING:
-    from fishd.lab.swimmer.wake import Quantity
 
 
 def picture_options(function: F) -> F:
@@ -69,33 +66,9 @@ def midlines(file: Path, settle: float, picture: Path | None, force: bool, as_js
 
 
 @click.command()
-@click.option(
-    "--field",
-    type=click.Choice(("vorticity", "speed", "pressure")),
-    default="vorticity",
-    show_default=True,
-    help="Quantity to draw.",
-)
-@click.option(
-    "--whole", is_flag=True, help="Draw the whole tank, not only the fish and its near wake."
-)
-@click.option(
-    "--limit",
-    type=FiniteRange(min=0.0, min_open=True),
-    help="Value at which the colours end, in the unit of the field. [default: the same for all "
-    "pictures of such a fish]",
-)
 @picture_options
-def wake(
-    file: Path,
-    field: "Quantity",
-    whole: bool,
-    limit: float | None,
-    picture: Path | None,
-    force: bool,
-    as_json: bool,
-) -> None:
-    """Draw the water at the end of a swim, and the body in it.
+def wake(file: Path, picture: Path | None, force: bool, as_json: bool) -> None:
+    """Draw the vorticity of the water around the fish at the end of a swim, and the body in it.
 
     SWIM is a file of 'fishctl simulate ... --to FILE.npz'. Without --plot, the picture is a .png
     file beside SWIM, named after it.
@@ -103,9 +76,8 @@ def wake(
     from fishd.lab.swimmer import wake as water
     from fishd.virtual.swimmer import checkpoint
 
-    path = _picture_path(picture, file, field, force)
+    path = _picture_path(picture, file, "vorticity", force)
     fish = water.restore_fish(checkpoint.load(file))
-    window = (water.whole_window if whole else water.window_around)(fish.settings)
-    scene = water.take_view(fish, field, window, water.COLUMNS)
-    water.draw_wake(scene, limit or water.choose_colour_limit(fish.settings, field), path)
+    scene = water.take_view(fish, water.window_around(fish.settings), water.COLUMNS)
+    water.draw_wake(scene, water.choose_colour_limit(fish.settings), path)
     print_paths([path], as_json)

@@ -22,6 +22,11 @@ class SystemdNotifier:
         self._next_feed = 0.0
         self._ready = False
 
+    @property
+    def is_service(self) -> bool:
+        """Whether systemd has started this process and waits for its messages."""
+        return bool(self._address)
+
     def ticked(self, now: float) -> None:
         """Feed the watchdog, and report readiness with the first tick; call it only from the tick.
 

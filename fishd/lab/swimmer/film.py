@@ -14,9 +14,6 @@ from fishd.core.errors import FishdError, MissingPackage
 from fishd.lab.drawing import load_matplotlib
 from fishd.lab.swimmer.wake import (
     COLOURS,
-    SIGNED_QUANTITIES,
-    UNITS,
-    Quantity,
     View,
     choose_colour_limit,
     round_number,
@@ -59,19 +56,12 @@ class Film:
     after an error, so that it shows the fish until then.
     """
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        settings: SwimmerSettings,
-        quantity: Quantity = "vorticity",
-    ) -> None:
+    def __init__(self, path: str | os.PathLike[str], settings: SwimmerSettings) -> None:
         """Raises as `check` does."""
         check(path)
         self.path = Path(path)
-        self._quantity: Quantity = quantity
         self._window = window_around(settings)
-        self._limit = choose_colour_limit(settings, quantity)
-        self._low = -self._limit if quantity in SIGNED_QUANTITIES else 0.0
+        self._limit = choose_colour_limit(settings)
         self._frames: list[Image.Image] = []
         self._times: list[float] = []
         self._stride = 1
@@ -96,7 +86,7 @@ class Film:
             return
         self._next = max(self._next + FRAME_INTERVAL_S, fish.time + 0.5 * FRAME_INTERVAL_S)
         if self._frame_count % self._stride == 0:
-            self._frames.append(self._paint(take_view(fish, self._quantity, self._window, COLUMNS)))
+            self._frames.append(self._paint(take_view(fish, self._window, COLUMNS)))
             self._times.append(fish.time)
         self._frame_count += 1
         if len(self._frames) > MAX_FRAMES:
@@ -107,7 +97,7 @@ class Film:
         """Return a frame: the water, the body in it, and a line of text below."""
         from PIL import Image, ImageDraw
 
-        water = self._colour(scene.values[::-1])
+        water = self._colour(scene.vorticity[::-1])
         rows, columns, _ = water.shape
         frame = Image.new("RGB", (columns, rows + _FOOTER_HEIGHT), _PAPER)
         frame.paste(Image.fromarray(water))
@@ -126,8 +116,8 @@ class Film:
         load_matplotlib()
         from matplotlib import colormaps
 
-        share = (values - self._low) / (self._limit - self._low)
-        colours: NDArray[np.uint8] = colormaps[COLOURS[self._quantity]](share, bytes=True)[..., :3]
+        share = 0.5 + 0.5 * values / self._limit
+        colours: NDArray[np.uint8] = colormaps[COLOURS](share, bytes=True)[..., :3]
         return colours
 
     def _draw_footer(self, frame: "Image.Image", scene: View, middle: int) -> None:
@@ -147,12 +137,12 @@ class Film:
         write(150, f"x = {100.0 * scene.x:.1f} cm")
         draw.line([(262, middle), (262 + pixels, middle)], fill=_INK, width=3)
         write(270 + pixels, f"{100.0 * length:g} cm")
-        right, limit = COLUMNS - 8, f"{self._limit:g} {UNITS[self._quantity]}"
+        right, limit = COLUMNS - 8, f"{self._limit:g} 1/s"
         write(right, limit, "rm")
         right -= 8 + round(draw.textlength(limit, font=self._font)) + _BAR_LENGTH
-        bar = np.linspace(self._low, self._limit, _BAR_LENGTH)[None].repeat(_BAR_HEIGHT, axis=0)
+        bar = np.linspace(-self._limit, self._limit, _BAR_LENGTH)[None].repeat(_BAR_HEIGHT, axis=0)
         frame.paste(Image.fromarray(self._colour(bar)), (right, middle - _BAR_HEIGHT // 2))
-        write(right - 8, f"{self._quantity} {self._low:g}", "rm")
+        write(right - 8, f"vorticity {-self._limit:g}", "rm")
 
     @cached_property
     def _font(self) -> Any:

@@ -1,8 +1,8 @@
-"""View of the water around a free swimmer, on square pixels, for pictures and films."""
+"""Vorticity of the water around a free swimmer, on square pixels, for pictures and films."""
 
 import math
 import os
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import numpy as np
@@ -20,17 +20,13 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Positions = NDArray[np.floating]
-Quantity = Literal["vorticity", "speed", "pressure"]
-QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
-UNITS = {"vorticity": "1/s", "speed": "m/s", "pressure": "Pa"}
-SIGNED_QUANTITIES = ("vorticity", "pressure")
-"""Quantities whose colours are symmetric about 0."""
 MAX_LEAD_LENGTHS, BEHIND, BESIDE = 0.9, 2.1, 0.55
 """Distances from the centre of the grid to the edges of the window [body lengths]."""
 _ROUND_DIGITS = (1, 2, 3, 5, 10)
 COLUMNS = 1200
 """Width of the water in a picture [pixels]."""
-COLOURS = {"vorticity": "RdBu_r", "speed": "YlGnBu", "pressure": "PuOr_r"}
+COLOURS = "RdBu_r"
+"""Colour map, which is symmetric about 0."""
 BODY_COLOUR = "0.25"
 _WIDTH_IN = 7.2
 _SIDE_MARGIN_IN = 1.35
@@ -47,11 +43,10 @@ class Window(NamedTuple):
 
 
 class View(NamedTuple):
-    """Quantity of the water, and the body in it, at one time, in the laboratory frame."""
+    """Vorticity of the water, and the body in it, at one time, in the laboratory frame."""
 
-    quantity: Quantity
-    values: Array
-    """Values in the unit of the quantity, shape (rows, columns), the lowest row first."""
+    vorticity: Array
+    """Shape (rows, columns), the lowest row first [1/s]."""
     window: Window
     """Window in the laboratory frame [m]."""
     outline: Array
@@ -89,24 +84,17 @@ def window_around(settings: SwimmerSettings) -> Window:
     )
 
 
-def whole_window(settings: SwimmerSettings) -> Window:
-    """Return the window of the whole tank."""
-    length, width = 0.5 * settings.water.length, 0.5 * settings.water.width
-    return Window(-length, length, -width, width)
-
-
-def take_view(fish: Fish, quantity: Quantity, window: Window, columns: int) -> View:
+def take_view(fish: Fish, window: Window, columns: int) -> View:
     """Return the view through a window of the grid; columns: its width in pixels."""
     pixel = (window.right - window.left) / columns
     rows = max(1, round((window.top - window.bottom) / pixel))
     x = window.left + pixel * (np.arange(columns) + 0.5)
     y = window.bottom + (window.top - window.bottom) / rows * (np.arange(rows) + 0.5)
-    values, at_x, at_y = _read_quantity(fish, quantity)
+    grid = fish.flow.grid
     along, across = fish.travelled
     motion = fish.motion()
     return View(
-        quantity,
-        _interpolate(values, at_x, at_y, x, y).T,
+        _interpolate(fish.flow.vorticity(), grid.x[1:-1], grid.y[1:-1], x, y).T,
         Window(
             window.left + along, window.right + along, window.bottom + across, window.top + across
         ),
@@ -117,20 +105,14 @@ def take_view(fish: Fish, quantity: Quantity, window: Window, columns: int) -> V
     )
 
 
-def choose_colour_limit(settings: SwimmerSettings, quantity: Quantity) -> float:
-    """Return the value at which the colours end: a round number, the same for all views.
+def choose_colour_limit(settings: SwimmerSettings) -> float:
+    """Return the vorticity at which the colours end [1/s]: a round number, the same for all views.
 
     It is computed from the expected speed of the tail and a wake thickness of about 0.1 L.
     """
-    body, water = settings.body, settings.water
     expected = estimate(settings)
     tail = 2.0 * math.pi * expected.frequency * expected.deflection
-    largest = {
-        "vorticity": tail / (0.1 * body.length),
-        "speed": 0.7 * tail,
-        "pressure": 0.25 * water.density * tail**2,
-    }[quantity]
-    return round_number(largest)
+    return round_number(tail / (0.1 * settings.body.length))
 
 
 def round_number(value: float) -> float:
@@ -142,18 +124,6 @@ def round_number(value: float) -> float:
     return min(choices, key=lambda choice: abs(math.log(choice / value)))
 
 
-def _read_quantity(fish: Fish, quantity: Quantity) -> tuple[Array, Array, Array]:
-    """Return values, shape (nx, ny), and their x and y coordinates on the grid [m]."""
-    flow = fish.flow
-    grid = flow.grid
-    if quantity == "vorticity":
-        return flow.vorticity(), grid.x[1:-1], grid.y[1:-1]
-    if quantity == "pressure":
-        return fish.settings.water.density * flow.p, grid.xc, grid.yc
-    u, v = 0.5 * (flow.u[1:] + flow.u[:-1]), 0.5 * (flow.v[:, 1:] + flow.v[:, :-1])
-    return np.hypot(u, v), grid.xc, grid.yc
-
-
 def _interpolate(values: Array, at_x: Array, at_y: Array, x: Positions, y: Positions) -> Array:
     """Return bilinear interpolations of a grid; beyond its ends, the values at the ends."""
     places = np.clip(x, at_x[0], at_x[-1]), np.clip(y, at_y[0], at_y[-1])
@@ -163,7 +133,7 @@ def _interpolate(values: Array, at_x: Array, at_y: Array, x: Positions, y: Posit
 def draw_wake(scene: View, limit: float, path: str | os.PathLike[str]) -> None:
     """Write the picture as PNG, PDF or SVG; raises `FishdError` and `MissingPackage`.
 
-    limit: value at which the colours end
+    limit: vorticity at which the colours end [1/s]
     """
     window = scene.window
     height = (
@@ -172,7 +142,7 @@ def draw_wake(scene: View, limit: float, path: str | os.PathLike[str]) -> None:
     with open_figure(path, (_WIDTH_IN, height + _TOP_MARGIN_IN)) as figure:
         axes = figure.subplots()
         image = axes.imshow(
-            scene.values,
+            scene.vorticity,
             origin="lower",
             extent=(
                 100.0 * window.left,
@@ -180,8 +150,8 @@ def draw_wake(scene: View, limit: float, path: str | os.PathLike[str]) -> None:
                 100.0 * window.bottom,
                 100.0 * window.top,
             ),
-            cmap=COLOURS[scene.quantity],
-            vmin=-limit if scene.quantity in SIGNED_QUANTITIES else 0.0,
+            cmap=COLOURS,
+            vmin=-limit,
             vmax=limit,
             interpolation="bilinear",
         )
@@ -191,21 +161,21 @@ def draw_wake(scene: View, limit: float, path: str | os.PathLike[str]) -> None:
         axes.set_xlabel("x (cm)")
         axes.set_ylabel("y (cm)")
         axes.set_title(
-            f"{scene.quantity} at {scene.time:.2f} s; the fish swims to the left with "
+            f"vorticity at {scene.time:.2f} s; the fish swims to the left with "
             f"{1e3 * scene.speed:.1f} mm/s",
             fontweight="normal",
         )
         extend = _find_exceeded_ends(scene, limit)
         bar_axes = axes.inset_axes((1.02, 0.0, 0.025, 1.0))
         bar = figure.colorbar(image, cax=bar_axes, extend=extend)
-        bar.set_label(f"{scene.quantity} ({UNITS[scene.quantity]})")
+        bar.set_label("vorticity (1/s)")
         _draw_scale_bar(axes, window)
 
 
 def _find_exceeded_ends(scene: View, limit: float) -> str:
     """Return the ends of the colour bar that values exceed, as matplotlib names them."""
-    low = scene.quantity in SIGNED_QUANTITIES and float(np.min(scene.values)) < -limit
-    high = float(np.max(scene.values)) > limit
+    low = float(np.min(scene.vorticity)) < -limit
+    high = float(np.max(scene.vorticity)) > limit
     return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[low, high]
 
 

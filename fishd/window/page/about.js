@@ -41,28 +41,29 @@ const Table = ({ label, head, rows }) => html`<div class="scroll" tabindex="0" r
   <thead><tr>${head.map((text) => html`<th>${text}</th>`)}</tr></thead>
   <tbody>${rows.map((cells) => html`<tr>${cells.map((cell) => html`<td>${cell}</td>`)}</tr>`)}</tbody></table></div>`;
 
-export function About({ fish, isPaired }) {
+export function About({ fish, isPaired, act, mayRestart }) {
   const [computer] = usePart(fish, "computer", isPaired), [disk] = usePart(fish, "disk", isPaired);
   const [settings] = usePart(fish, "settings", isPaired), [camera] = usePart(fish, "camera", isPaired);
   const [log, loadLog] = usePart(fish, "log", isPaired);
   return html`<div class="about"><div>
-    <${Part} id="computer" title="Computer" answer=${computer}><${Computer} computer=${computer.result} disk=${disk} /><//>
+    <${Part} id="computer" title="Computer" answer=${computer}><${Computer} computer=${computer.result} ...${{ disk, act, mayRestart }} /><//>
     <${Part} id="calibrations" title="Calibrations" answer=${settings}><${Calibrations} rows=${[...settings.result?.calibrations ?? [], ...camera.result ?? []]} /><//>
     <${Part} id="configuration" title="Configuration" answer=${settings}><${Configuration} keys=${settings.result?.keys} /><//></div>
-    <div><${Checks} fish=${fish} restart=${computer.result?.restart} />
+    <div><${Checks} fish=${fish} isService=${computer.result?.is_service} />
     <${Part} id="log" title="Log" answer=${log} load=${loadLog}>
       ${log.result?.problem && html`<p class="muted">${sentence(log.result.problem)}</p>`}
       ${log.result?.lines.length > 0 && html`<pre tabindex="0" aria-label="Latest lines last">${log.result.lines.join("\n")}</pre>`}<//></div></div>`;
 }
 
-function Computer({ computer, disk: { result: disk, failure } }) {
+function Computer({ computer, disk: { result: disk, failure }, act, mayRestart }) {
   const hours = disk && disk.free / disk.hourly;
   const source = disk?.recordings ? `as in ${disk.recordings === 1 ? "the latest recording" : `the latest ${disk.recordings} recordings`}` : "as is usual without a camera";
   const room = failure ? sentence(failure.message) : !disk ? "Loading …" : disk.free === null ? "unknown" : html`${gigabytes(disk.free)} of ${gigabytes(disk.size)} free:
     about ${hours < 48 ? `${significant(hours, 2)} hours` : `${significant(hours / 24, 2)} days`} of recording at ${number(disk.hourly / 1e6, 1)} MB an hour, ${source}`;
   return html`<dl>${computer.rows.map(({ name, value }) => html`<dt>${name}</dt><dd>${value}</dd>`)}
     <dt>disk</dt><dd>${room}</dd>
-    ${computer.restart && html`<dt>restart</dt><dd>The page may not restart fishd. Type: <code>${computer.restart}</code></dd>`}</dl>`;
+    ${computer.is_service && html`<dt>restart</dt><dd><button type="button" disabled=${!mayRestart} onClick=${() => act("restart", {})}>Restart fishd</button>
+      <span class="muted">It reads its configuration again, while no controller runs.</span></dd>`}</dl>`;
 }
 
 const Calibrations = ({ rows }) => (rows.length === 0 ? html`<p class="muted">This robot has none.</p>`
@@ -79,7 +80,7 @@ function Configuration({ keys }) {
 }
 
 /** The checks of `fishctl doctor`, run when asked for. */
-function Checks({ fish, restart }) {
+function Checks({ fish, isService }) {
   const [answer, setAnswer] = useState({ result: [] });
   const [isRunning, setRunning] = useState(false);
   const run = async () => {
@@ -89,7 +90,7 @@ function Checks({ fish, restart }) {
   };
   return html`<${Part} id="checks" title="Checks" answer=${answer} foot=${html`<div class="buttons">
       <button type="button" disabled=${isRunning} onClick=${run}>${isRunning ? "They run …" : "Run the checks"}</button>
-      <span class="muted">As fishctl doctor does; nothing moves.${restart && " The page sees no devices: for these, type sudo -u fishd fishctl doctor."}</span></div>`}>
+      <span class="muted">As fishctl doctor does; nothing moves.${isService && " The page sees no devices: for these, type sudo -u fishd fishctl doctor."}</span></div>`}>
     ${answer.result?.length > 0 && html`<${Table} label="Checks" head=${["result", "check", "about"]} rows=${answer.result.map(({ check, level, message, remedy }) => [
       html`<span class=${`pill small ${PILLS[level] ?? ""}`}>${level === "FAIL" ? "failed" : level}</span>`, check,
       html`${message}${remedy && html`<br /><span class="muted">${remedy}</span>`}`])} />`}<//>`;

@@ -473,7 +473,8 @@ function renderAll() {
   renderValues();
   render(state.name && state.isCameraOpen ? html`<${Camera} fish=${state.name} close=${() => showCamera(false)} />` : null, byId("camera"));
   byId("show-camera").hidden = state.isCameraOpen;
-  render(state.place === "fish" && state.name ? html`<${About} fish=${state.name} isPaired=${state.session?.paired} />` : null, byId("about"));
+  render(state.place === "fish" && state.name ? html`<${About} fish=${state.name} isPaired=${state.session?.paired} act=${act}
+    mayRestart=${state.session?.scope === "drive" && state.status?.mode !== "running"} />` : null, byId("about"));
   render(html`<${Banner} />`, byId("banner"));
   render(html`<${Drive} ...${shared} />`, byId("drive"));
   render(html`<${ChartTools} ...${{ charts, shownName }} />`, byId("chart-head"));

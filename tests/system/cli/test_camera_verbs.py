@@ -1,20 +1,16 @@
 """`fishctl camera` on a real fishd-camera above a real fishd."""
 
 import json
-import os
-import pty
 import re
-import select
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import pytest
 from rigs.camera_process import CameraProcess, running_camera
-from rigs.drawing_interrupted import ENTER_SCREEN, LEAVE_SCREEN, signal_as_drawing_begins
 from rigs.processes import (
     FISHCTL,
     PATIENCE,
@@ -31,7 +27,6 @@ from rigs.processes import (
 from fishd.camera.settings import load
 from fishd.client import Fish
 
-FRAME = re.compile(r"frame (\d+),")
 TICK = 0.05
 OFF, TILT, LATENCY = 3.0, 0.04, 0.03
 CAMERA = (
@@ -89,33 +84,6 @@ def width_of(picture: Path) -> int:
     return image.shape[1]
 
 
-def run_in_terminal(
-    columns: int, *words: str, until: Callable[[str], bool] | None = None, **env: str
-) -> str:
-    """Return what a verb draws on a terminal.
-
-    until: condition of the drawn text on which Ctrl-C is pressed
-    """
-    pid, terminal = pty.fork()
-    if pid == 0:
-        screen = {"TERM": "xterm-256color", "COLUMNS": str(columns), "LINES": "30"}
-        environment = os.environ | screen | env
-        os.execve(FISHCTL, ["fishctl", "camera", *words], environment)
-    drawn, start = b"", time.monotonic()
-    while time.monotonic() - start < PATIENCE:
-        if until and until(drawn.decode(errors="replace")):
-            os.write(terminal, b"\x03")
-            until = None
-        if select.select([terminal], [], [], 0.1)[0]:
-            try:
-                drawn += os.read(terminal, 65536)
-            except OSError:  # the verb has ended
-                break
-    os.close(terminal)
-    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
-    return drawn.decode(errors="replace")
-
-
 def test_status_says_how_the_camera_is(camera: CameraProcess, daemon: Daemon) -> None:
     shown = output_of("status")
     described = f"a simulated camera above the fish at {daemon.endpoint}"
@@ -136,52 +104,17 @@ def test_without_a_camera_a_verb_says_so_in_one_line(tmp_path: Path) -> None:
     )
 
 
-def test_a_view_without_a_terminal_is_a_line_and_for_a_program_json(tmp_path: Path) -> None:
-    line = output_of("view")
-    facts = json.loads(output_of("view", "--json", "--plot", tmp_path / "now.png"))
-    assert facts["path"] == str(tmp_path / "now.png")
+def test_a_view_is_a_file_with_a_line_or_json_about_it(tmp_path: Path) -> None:
+    now = tmp_path / "now.png"
+    assert re.fullmatch(
+        rf"{now}: frame \d+, \d+ ms old when it came\n", output_of("view", "--plot", now)
+    )
+    assert width_of(now) == 84 * 7
+    facts = json.loads(output_of("view", "--json", "--whole", "--plot", tmp_path / "whole.png"))
+    assert facts["path"] == str(tmp_path / "whole.png")
     assert facts["frame"] > 0
     assert 0.0 < facts["age"] < PATIENCE
-    assert re.fullmatch(r"frame \d+, (29|30|31)\.\d a second, \d+ ms old when it came\n", line)
-
-
-def test_a_view_in_a_terminal_is_a_picture_that_fits_its_width() -> None:
-    for columns in (40, 100):
-        lines = re.sub(r"\x1b\[[0-9;]*m", "", run_in_terminal(columns, "view")).splitlines()
-        rows = [line for line in lines if line.startswith("▀")]
-        assert 10 < len(rows) <= 28
-        assert max(map(len, rows)) <= columns
-        assert {len(row) for row in rows} == {len(rows[0])}
-        assert lines[-1].startswith("frame ")
-
-
-def test_a_view_that_follows_draws_again_until_it_is_interrupted(swimming: Daemon) -> None:
-    drawn = run_in_terminal(
-        100, "view", "--follow", until=lambda drawn: len(set(FRAME.findall(drawn))) > 5
-    )
-    assert len(set(FRAME.findall(drawn))) > 5
-    assert drawn.count(ENTER_SCREEN) == drawn.count(LEAVE_SCREEN) == 1  # the screen is restored
-
-
-def test_ctrl_c_as_a_view_takes_the_screen_ends_it(camera: CameraProcess, tmp_path: Path) -> None:
-    drawn = run_in_terminal(100, "view", "--follow", **signal_as_drawing_begins(tmp_path, "SIGINT"))
-    assert drawn.count(ENTER_SCREEN) == drawn.count(LEAVE_SCREEN) == 1
-    assert "Traceback" not in drawn
-
-
-def test_a_view_is_written_with_the_axis_once_searched(swimming: Daemon, tmp_path: Path) -> None:
-    line = output_of("view", "--axis", "--plot", tmp_path / "a.png")
-    offset = re.search(r"axis ([+-][\d.]+) px", line)
-    assert float(offset[1]) == pytest.approx(OFF, abs=1.0)
-    assert width_of(tmp_path / "a.png") == 84 * 7
-    output_of("view", "--whole", "--plot", tmp_path / "whole.png")
     assert width_of(tmp_path / "whole.png") >= 84
-
-
-def test_no_axis_is_detected_while_the_fish_rests(daemon: Daemon) -> None:
-    daemon.wait_until_still()
-    complaint = one_line(fishctl("camera", "view", "--axis"))
-    assert complaint.startswith("fishctl: no axis was detected, as no tail moves: let the fish")
 
 
 def test_a_picture_of_another_kind_is_refused_at_once(tmp_path: Path) -> None:
@@ -200,7 +133,7 @@ def test_a_picture_that_cannot_be_written_is_refused_before_the_fish_swims(
     assert done.returncode == 2
     assert "its folder does not exist; create it" in one_line(done)
     assert {tick["mode"] for tick in seen} == {"idle"}
-    looked = fishctl("camera", "view", "--axis", "--plot", f"{tmp_path}/nowhere/a.png")
+    looked = fishctl("camera", "view", "--plot", f"{tmp_path}/nowhere/a.png")
     assert "its folder does not exist; create it" in one_line(looked)
 
 

@@ -16,7 +16,13 @@ with show_progress(2.0, "s", err={err}) as show:
 print_json([1])
 """
 
-
+VALUES = """
+from fishd.cli.progress import show_progress
+from fishd.core.experiments import Estimate
+with show_progress(2.0, "s") as show:
+    show.at(1.0)
+    show.estimate([Estimate(name, 1.7, 1.6, 1.8, "Hz") for name in ("lowest", "highest")])
+"""
 WAITING = """
 from fishd.cli.progress import show_waiting
 with show_waiting("fitting"):
@@ -47,6 +53,14 @@ def test_the_bar_is_on_standard_error_and_the_lines_on_either_stream(err: bool) 
     assert "2 of 2 s" in shown
     assert ("one is done" in shown) == err
     assert out == ("" if err else "one is done\n") + "[\n  1\n]\n"
+
+
+def test_values_are_whole_below_the_bar() -> None:
+    _, shown = run_on_terminal(VALUES)
+    lines = shown.splitlines()
+    place = lines.index("lowest 1.7 Hz [1.6, 1.8], highest 1.7 Hz [1.6, 1.8]")
+    assert "1 of 2 s" in lines[place - 1]
+    assert "left" in lines[place - 1]
 
 
 def test_work_of_unknown_length_is_named_on_a_terminal_only() -> None:

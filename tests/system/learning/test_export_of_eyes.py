@@ -26,7 +26,6 @@ from fishd.learning.env.environment import SwimEnv
 from fishd.learning.export import export, export_model
 from fishd.learning.extractors import random_angles
 from fishd.learning.links.simulated_link import Camera, SimulatedLink
-from fishd.learning.look import look
 from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
 from fishd.learning.settings import (
     EnvironmentSettings,
@@ -149,13 +148,6 @@ def test_an_exported_policy_swims_by_sight(tmp_path: Path, by_sight: Outcome) ->
     assert file.read(exported.path).card.pictures == StackSettings()
     standings, _ = compare(Config(), [str(exported.path)], seconds=20.0, settle=5.0)
     assert standings[0].relative_thrust == pytest.approx(past.relative_thrust, abs=0.05)
-
-
-@pytest.mark.slow
-def test_a_policy_by_sight_looks_where_the_tail_moves(tmp_path: Path, by_sight: Outcome) -> None:
-    path = export(by_sight.best, tmp_path / "eye.onnx").path
-    sensitivity = look(str(path), Config(), DEFAULT, 10.0)  # with the camera of its training
-    assert sensitivity.share > 2.0 * sensitivity.area
 
 
 @pytest.mark.slow

@@ -33,7 +33,7 @@ async def test_the_versions_are_those_of_fish_page_and_system(window: WindowProc
     assert rows["fish"] == f"fishd {__version__}, robot simulated"
     assert rows["page"] == f"fishd-window {__version__}"
     assert {"Python", "system", "kernel", "computer"} <= rows.keys()
-    assert computer["restart"] == ""
+    assert computer["is_service"] is False
 
 
 async def test_the_configuration_shows_what_differs_from_the_defaults(
@@ -176,7 +176,7 @@ def write_program(path: Path, text: str) -> None:
     path.chmod(0o755)
 
 
-async def test_the_log_of_a_service_is_the_end_of_its_journal_and_its_restart_is_a_command(
+async def test_the_log_of_a_service_is_the_end_of_its_journal_and_it_can_restart(
     daemon: Daemon, tmp_path: Path, tools: Path
 ) -> None:
     write_program(tools / "journalctl", JOURNAL.format(folder=tmp_path))
@@ -184,7 +184,7 @@ async def test_the_log_of_a_service_is_the_end_of_its_journal_and_its_restart_is
         log = await read(window, "log")
         assert log == {"lines": [f"line {n}" for n in range(301, 501)], "problem": ""}
         assert "--unit=fishd.service --lines=200" in (tmp_path / "words").read_text()
-        assert (await read(window, "computer"))["restart"] == "sudo systemctl restart fishd"
+        assert (await read(window, "computer"))["is_service"] is True
 
 
 @pytest.mark.parametrize(

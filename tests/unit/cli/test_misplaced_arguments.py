@@ -22,7 +22,7 @@ def test_a_message_on_a_training_names_its_file(verb: tuple[str, ...], override:
     )
 
 
-@pytest.mark.parametrize("verb", [("learn", "look"), ("compare",), ("policies", "show")])
+@pytest.mark.parametrize("verb", [("compare",), ("policies", "show")])
 @pytest.mark.parametrize(
     ("given", "complaint"),
     [
@@ -50,9 +50,8 @@ def test_the_name_of_a_run_folder_is_known_without_a_slash_too(
     (tmp_path / "first").mkdir()
     (tmp_path / "first" / "settings.yaml").touch()
     monkeypatch.chdir(tmp_path)
-    for verb in (("learn", "look"), ("compare",)):
-        line = one_line(fishctl(*verb, "first"))
-        assert line.startswith("fishctl: first is the folder of a training, not a policy file; ")
+    line = one_line(fishctl("compare", "first"))
+    assert line.startswith("fishctl: first is the folder of a training, not a policy file; ")
 
 
 @pytest.fixture
@@ -61,8 +60,8 @@ def eye(tmp_path: Path) -> str:
 
 
 def test_an_address_in_place_of_the_file_of_a_simulated_camera_is_refused(eye: str) -> None:
-    for *verb, option in (("learn", "look", "--camera-config"), ("compare", "--camera")):
-        done = fishctl(*verb, eye, option, "tcp://127.0.0.1:9875")
+    for option in ("--camera-config", "--camera"):
+        done = fishctl("compare", eye, option, "tcp://127.0.0.1:9875")
         assert one_line(done) == (
             "fishctl: 'tcp://127.0.0.1:9875' is the address of a running fishd-camera, which sees "
             "the fish of a running fishd; in simulation a simulated camera is needed, such as "
@@ -73,14 +72,13 @@ def test_an_address_in_place_of_the_file_of_a_simulated_camera_is_refused(eye: s
 
 def test_a_true_camera_cannot_see_a_simulated_fish(eye: str) -> None:
     file = ROOT / "config" / "camera.yaml"
-    for verb in (("learn", "look"), ("compare",)):
-        line = one_line(fishctl(*verb, eye, "--camera-config", str(file)))
-        assert line.startswith(f"fishctl: {file}: source is v4l2; in simulation a simulated camera")
+    line = one_line(fishctl("compare", eye, "--camera-config", str(file)))
+    assert line.startswith(f"fishctl: {file}: source is v4l2; in simulation a simulated camera")
 
 
-@pytest.mark.parametrize("verb", ["status", "view", "align"])
+@pytest.mark.parametrize("verb", ["status", "view --plot a.png", "align"])
 def test_a_file_in_place_of_the_address_of_a_camera_is_refused(verb: str) -> None:
-    line = one_line(fishctl("camera", verb, "--camera", "config/web.yaml"))
+    line = one_line(fishctl("camera", *verb.split(), "--camera", "config/web.yaml"))
     assert line.startswith("fishctl: 'config/web.yaml' is a file, for 'fishd-camera --config' and")
     assert line.endswith("a running fishd-camera takes requests, such as tcp://127.0.0.1:9875\n")
 

@@ -18,6 +18,8 @@ NEUTRAL_LIMIT = 0.3
 CONFIG = "etc/fishd/fishd.yaml"
 STATUS = ("fishctl", "status", "--timing")
 """Command that shows whether the loop has real-time scheduling."""
+RESTART = ("sh", "-c", "fishctl restart 2>&1")
+"""Command that asks fishd for a restart, and shows why it is refused."""
 REALTIME = "real-time scheduling"
 """Words of its output where the loop has it."""
 FAULT = " fault: "
@@ -127,6 +129,28 @@ def stop(rig: Rig) -> Row:
     return Row("`systemctl stop`", *rig.time_pulses(begun), None, f"stopped after {ended:.2f} s")
 
 
+def restarted(rig: Rig) -> Row:
+    """Ask fishd for a restart: refused while it swims, else systemd starts it again."""
+    config = rig.container.root / CONFIG
+    good = config.read_text()
+    refused = rig.container.run(*RESTART, check=False)
+    rig.container.run("fishctl", "stop")
+    config.write_text(good + WRONG_LINE)
+    try:
+        refused += rig.container.run(*RESTART, check=False)
+    finally:
+        config.write_text(good)
+    if "[running]" not in refused or "[bad-configuration]" not in refused:
+        raise BrokenPromise(f"a restart is not refused: {refused}")
+    begun = time.monotonic()
+    rig.container.run("fishctl", "restart")
+    again = rig.when(begun, "Started fishd.service")
+    pulses = rig.time_pulses(begun)
+    if rig.container.show(_UNIT, "Result") != "success":
+        raise BrokenPromise("a restart counts as a failure")
+    return Row("`fishctl restart`", *pulses, again, "refused while it swims, else restarted")
+
+
 def killed(rig: Rig) -> Row:
     """Kill fishd by SIGKILL: the script in pigpiod acts, then ExecStopPost, then a restart."""
     return _check_restart(rig, "kill −9", rig.signal("SIGKILL"), "Main process exited", "ended")
@@ -195,6 +219,7 @@ def wrong_config(rig: Rig) -> Row:
 TRIALS: tuple[Callable[[Rig], Row], ...] = (
     start,
     stop,
+    restarted,
     killed,
     hung,
     killed_again_and_again,
