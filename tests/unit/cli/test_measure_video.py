@@ -203,8 +203,9 @@ def test_a_video_with_the_head_at_the_right_is_turned(tmp_path: Path) -> None:
 
 
 def test_the_tail_is_learned_from_pictures_of_a_fast_camera(video: Path, tmp_path: Path) -> None:
-    done = measure(video, tmp_path / "fish.csv", "--rate", "5000", "--json")
-    assert json.loads(done.stdout)["known"] > 0.95 * 30 * SECONDS
+    done = measure(video, tmp_path / "fish.csv", "--rate", "5000")
+    assert done.returncode == 0
+    assert "the tail is learned from 0 s of the video on" in done.stderr
 
 
 Make = Callable[[Path], Path]
