@@ -48,11 +48,9 @@ settings.load_profile("fishd")
 UNIT = Path(__file__).parent / "unit"
 SERVICE_SOCKET = Path("/run/fishd/control")
 LONG_MODULES = {
-    "test_unknown_keys",
-    "test_site",
-    "test_measure",
-    "test_reliability",
-    "test_doctor_bench",
+    *("test_unknown_keys", "test_site", "test_measure", "test_reliability", "test_doctor_bench"),
+    *("test_window_hour", "test_measured_tail", "test_half_open", "test_socket_files"),
+    *("test_estop", "test_cluster", "test_seeds", "test_step_response"),
 }
 """Modules with a test that takes longer than ten others; these begin first."""
 
@@ -138,14 +136,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _deal(items: list[pytest.Item], count: int) -> list[list[pytest.Item]]:
-    """Return equal parts, each of modules from all folders."""
-    modules = sorted(
-        {item.path for item in items}, key=lambda path: (path.stem not in LONG_MODULES, path)
-    )
+    """Return equal parts, each of modules from all folders; long modules are at the begin."""
+    modules = sorted({item.path for item in items})
+    long = [path for path in modules if path.stem in LONG_MODULES]
     place = {path: number % count for number, path in enumerate(modules)}
-    items = sorted(items, key=lambda item: place[item.path])
+    rest = sorted(
+        (item for item in items if item.path not in long), key=lambda item: place[item.path]
+    )
     bounds = [len(items) * k // count for k in range(count + 1)]
-    return [items[first:end] for first, end in pairwise(bounds)]
+    parts = []
+    for k, (first, end) in enumerate(pairwise(bounds)):
+        part = [item for item in items if item.path in long[k::count]]
+        cut = max(0, end - first - len(part)) if end < len(items) else len(rest)
+        parts.append(part + rest[:cut])
+        rest = rest[cut:]
+    return parts
 
 
 def pytest_collection_finish() -> None:

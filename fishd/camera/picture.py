@@ -14,7 +14,7 @@ from fishd.core.camera_frames import Pixels
 _TURNS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
 
-def read_picture(path: Path) -> Pixels | None:
+def read_picture(path: Path) -> "Pixels | None":
     """Return the grey levels of the picture in a file; None if it contains none."""
     picture = None
     with suppress(cv2.error):  # it is too large

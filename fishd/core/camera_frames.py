@@ -1,15 +1,17 @@
 """Frames of a camera, and the selection of the frames that a policy sees in a tick."""
 
 from collections import deque
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeAlias
 
-import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from fishd.core.schema import note, unit
 
-Pixels = NDArray[np.uint8]
+if TYPE_CHECKING:  # programs that list recordings need no numpy
+    import numpy as np
+    from numpy.typing import NDArray
+
+Pixels: TypeAlias = "NDArray[np.uint8]"
 """Grey levels, shape (height, width)."""
 
 

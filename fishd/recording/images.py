@@ -10,11 +10,9 @@ from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
 import msgspec
-import numpy as np
 from msgspec import UNSET, Struct, structs
-from numpy.typing import NDArray
 
-from fishd.core.camera_frames import FrameHead
+from fishd.core.camera_frames import FrameHead, Pixels
 from fishd.core.decoding import decoder
 from fishd.core.errors import MissingPackage, RecordingError
 from fishd.core.schema import fields_of, note
@@ -63,7 +61,7 @@ class RecordedFrame(NamedTuple):
     session: str
     exposure: float | None
     """Duration of the exposure [s]; None if unknown."""
-    pixels: NDArray[np.uint8]
+    pixels: Pixels
     """Grey levels, shape (height, width)."""
 
 
@@ -88,7 +86,7 @@ def image_json_schema() -> bytes:
     return msgspec.json.encode({"title": IMAGE_SCHEMA, "type": "object", "properties": properties})
 
 
-def encode_frame(head: FrameHead, pixels: NDArray[np.uint8]) -> bytes:
+def encode_frame(head: FrameHead, pixels: Pixels) -> bytes:
     """Return the message of a frame; raise `MissingPackage` without OpenCV (extra: camera)."""
     _, png = _cv2().imencode(".png", pixels, [_cv2().IMWRITE_PNG_COMPRESSION, _COMPRESSION_LEVEL])
     nanoseconds = max(0, round(head.t * 1e9))
@@ -120,6 +118,8 @@ def decode_frame(payload: bytes) -> RecordedFrame:
     except (ValueError, struct.error) as error:
         why = str(error) if isinstance(error, _InvalidPicture) else "is damaged"
         raise RecordingError(f"the picture of frame {message.seq} {why}") from None
+    import numpy as np  # so does cv2
+
     pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
     if pixels is None:
         raise RecordingError(f"the picture of frame {message.seq} cannot be read")

@@ -32,7 +32,6 @@ from fishd.core.errors import FishdError, RecordingError
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
 from fishd.core.tail_reading import RecordedTail
-from fishd.recording.fin_angle import interpolate
 from fishd.recording.images import (
     IMAGE_TOPIC,
     TAIL_TOPIC,
@@ -426,6 +425,8 @@ class Run:
                 )
         table = ticks_to_frame(self.ticks).assign(elapsed=self.times_of("tick"))
         if self.tails:
+            from fishd.recording.fin_angle import interpolate  # needs numpy
+
             times = [tick.time for tick in self.ticks]
             table["fin_angle"], table["fin_angle_uncertainty"] = interpolate(self.tails, times)
         return table

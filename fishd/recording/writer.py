@@ -10,14 +10,12 @@ from time import monotonic, time_ns
 from typing import Any, Self
 
 import msgspec
-import numpy as np
 from mcap.writer import CompressionType, Writer
 from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from fishd.config import Config, to_yaml
-from fishd.core.camera_frames import FrameHead
+from fishd.core.camera_frames import FrameHead, Pixels
 from fishd.core.decoding import decoder
 from fishd.core.errors import RecordingError
 from fishd.core.protocol import Calibrations
@@ -185,7 +183,7 @@ class RunWriter:
         self._add("status", status, self._encode(status))
         self.tally.status(status)
 
-    def frame(self, head: FrameHead, pixels: NDArray[np.uint8]) -> int:
+    def frame(self, head: FrameHead, pixels: Pixels) -> int:
         """Record a frame of a camera; return the number of frames that are missing before it.
 
         pixels: shape (height, width)

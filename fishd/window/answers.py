@@ -9,7 +9,7 @@ import msgspec
 from aiohttp import web
 from msgspec import Struct
 
-from fishd.core import text
+from fishd.core import schema, text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError, FishError, NoDaemon, ParameterError, Refused
 from fishd.core.experiment_queue import QueueError
@@ -58,10 +58,11 @@ async def read_body(
 def convert(data: Any, kind: type[T], prefix: str = "") -> T:
     """Return data as a struct; raise `ApiError`, whose message begins with `prefix`."""
     try:
-        return msgspec.convert(data, kind)
-    except msgspec.ValidationError as error:
-        message = f"{prefix}{text.error_message(error)}"
-        raise ApiError(400, "bad-arguments", message) from None
+        return schema.convert(data, kind)
+    except schema.Problem as problem:
+        message = str(problem).replace(" (or null)", "")
+        where = "".join(f"{text.quoted(name)}: " for name in problem.path)
+        raise ApiError(400, "bad-arguments", f"{prefix}{where}{text.line(message)}") from None
 
 
 def success(result: Any) -> web.Response:

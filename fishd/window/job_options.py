@@ -104,8 +104,12 @@ def check_parameters(options: Any, controllers: Collection[ControllerInfo]) -> N
             try:
                 msgspec.convert(value, Word)
             except msgspec.ValidationError:
-                needed = f"a name or the path of a {suffix} file" if suffix else "a word or numbers"
-                message = f"{name}: '{text.quoted(value)}' is not valid: {needed} is needed"
+                needed = (
+                    f"a name or the path of a {suffix} file is needed"
+                    if suffix
+                    else "a word is needed, or numbers such as 1,1.5,2"
+                )
+                message = f"{name}: '{text.quoted(value)}' is not valid: {needed}"
                 raise ParameterError(message) from None
 
 

@@ -63,7 +63,7 @@ class JobRequests:
             access.post("/api/jobs/check", self._check_job, JobRequest, scope="watch"),
             access.post("/api/jobs/{job}/stop", self._stop_job, NoArguments),
             access.post("/api/jobs/{job}/dismiss", self._dismiss_job, NoArguments),
-            access.get("/api/runs", lambda _: jobs.runs.list_all(), self.waiting_for_disk),
+            access.get("/api/runs", self._list_runs, self.waiting_for_disk),
             access.get("/api/runs/{run}/plot.png", self._plot_run, self.waiting_for_disk),
             *RunRequests(access, jobs.runs, self.waiting_for_disk).routes,
         ]
@@ -85,6 +85,16 @@ class JobRequests:
     async def _list_forms(self, _: web.Request) -> list[Form]:
         return [form for form, _ in (await self._jobs.forms.all()).values()]
 
+    async def _list_runs(self, _: web.Request) -> list[dict[str, Any]]:
+        """Return all runs, those of a fish without a name with that of its control socket."""
+        runs: list[dict[str, Any]] = await self._jobs.runs.list_all()
+        for run in runs:
+            words = run.get("command") or []
+            for endpoint, name in self._pages.names.items():
+                if run.get("on") == "live" and endpoint in words:
+                    run["about"].setdefault("subject", name)
+        return runs
+
     async def check_job(self, body: JobRequest) -> WantedJob:
         """Return a job with checked options; raise `ApiError` and `JobError`."""
         link = self._pages.find_link(body.fish)
@@ -97,7 +107,9 @@ class JobRequests:
             message = f"no such kind '{text.quoted(body.kind)}'; valid: {', '.join(forms)}, resume"
             raise ApiError(400, "unknown-kind", message)
         form, kind = forms[body.kind]
-        options = convert(body.options, kind, f"{body.kind}: ")
+        options: Any = convert(body.options, kind, f"{body.kind}: ")
+        if body.kind == "record" and not options.subject:
+            options.subject = self._pages.names.get(link.endpoint)
         if getattr(options, "parameters", None):
             if not link.controllers:
                 message = "fishd has not answered yet, so no controller is known"

@@ -19,7 +19,7 @@ from fishd.core.errors import install_command
 from fishd.core.process.service import run_service
 from fishd.core.process.shutdown import exit_now
 from fishd.core.process.systemd_notify import SystemdNotifier
-from fishd.window.settings import DEFAULT_LISTEN, WindowSettings, load
+from fishd.window.settings import DEFAULT_LISTEN, UNNAMED_FISH, WindowSettings, load
 
 log = logging.getLogger(__name__)
 NAME = "fishd-window"
@@ -82,7 +82,7 @@ def load_options(
     """Return the settings that these options name; `fishctl --endpoint` names the fish, too."""
     endpoint = click.get_current_context().find_root().obj
     if endpoint and not fish:
-        fish = {"fish": endpoint}
+        fish = {UNNAMED_FISH: endpoint}
     return load(path, listen=listen, fish=fish, state=state)
 
 

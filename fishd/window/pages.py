@@ -19,6 +19,7 @@ from fishd.window.fish_link import FishLink
 from fishd.window.foxglove import FoxglovePage
 from fishd.window.jobs import Job
 from fishd.window.live import Driver, LivePage, encode, encode_message
+from fishd.window.settings import UNNAMED_FISH
 from fishd.window.viewer import Viewer
 
 log = logging.getLogger(__name__)
@@ -58,6 +59,13 @@ class Pages:
         """Driver of each fish that swims on without its page."""
         self._endings: set[asyncio.Task[None]] = set()
         """Ends of the role of drivers that are gone; fishd may be slow to answer."""
+
+    @property
+    def names(self) -> dict[str | None, str]:
+        """Name of each fish by its control socket; empty for one fish that was given no name."""
+        if list(self.links) == [UNNAMED_FISH]:
+            return {}
+        return {link.endpoint: name for name, link in self.links.items()}
 
     async def run(self) -> None:
         """Follow the fish, and watch over the pages, until this task is cancelled."""

@@ -53,6 +53,7 @@ class RunRequests:
             access.get("/api/results.png", self._draw_results, waiting),
             access.get("/api/trash", lambda _: runs.call_verb("trash"), waiting),
             access.post("/api/trash/{id}/restore", self._restore, NoArguments, waiting=waiting),
+            access.post("/api/trash/empty", self._empty_trash, NoArguments, waiting=waiting),
         ]
 
     async def _download(self, request: web.Request) -> web.StreamResponse:
@@ -67,6 +68,9 @@ class RunRequests:
 
     async def _restore(self, request: web.Request, _: NoArguments) -> Any:
         return await self._runs.change("restore", check_name(request.match_info["id"]))
+
+    async def _empty_trash(self, _request: web.Request, _: NoArguments) -> Any:
+        return await self._runs.call_verb("trash", options=["--empty"])
 
     async def _show_results(self, request: web.Request) -> Any:
         return await self._runs.call_verb("show", *_list_compared(request))

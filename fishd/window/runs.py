@@ -83,9 +83,9 @@ class Runs:
         except files.FileProblem as problem:
             raise JobError(str(problem)) from None
 
-    async def call_verb(self, verb: str, *names: str) -> Any:
+    async def call_verb(self, verb: str, *names: str, options: Sequence[str] = ()) -> Any:
         """Return what a verb of `fishctl runs` prints as JSON, one at a time; raise `JobError`."""
-        words = ["runs", verb, f"--folder={self.folder}", "--json", "--", *names]
+        words = ["runs", verb, f"--folder={self.folder}", *options, "--json", "--", *names]
         async with self._calling:
             return await call_json(words, self.folder)
 

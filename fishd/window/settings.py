@@ -14,6 +14,8 @@ from fishd.core.files import expand_user
 from fishd.core.schema import Problem, convert, note
 
 DEFAULT_LISTEN = "127.0.0.1:8880"
+UNNAMED_FISH = "fish"
+"""Name in addresses of a fish that was given none."""
 FISH_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,39}")
 """Names of fish, which are parts of the page's addresses."""
 _LISTEN = re.compile(r"(?P<host>[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):(?P<port>[0-9]{1,5})")
@@ -74,7 +76,7 @@ class WindowSettings(Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def endpoints(self) -> dict[str, str | None]:
         """Control socket of each fish, by its name; None for the fishd of this machine."""
-        return {**self.fish} or {"fish": None}
+        return {**self.fish} or {UNNAMED_FISH: None}
 
     @property
     def camera_addresses(self) -> dict[str, str | None]:

@@ -1,5 +1,6 @@
 """Fixtures of a real daemon on the simulated fish, one per test or per module."""
 
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,6 +27,18 @@ def own_daemon(tmp_path: Path) -> Iterator[Daemon]:
     """Yield a real daemon on the simulated fish, at rest, for a test that ends it."""
     with running(tmp_path) as daemon:
         yield daemon
+
+
+@pytest.fixture
+def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
+    """Yield a daemon that takes itself for a service, with the file fishd.yaml in `tmp_path`."""
+    path, file = str(tmp_path / "notify"), tmp_path / "fishd.yaml"
+    file.write_text("name: pike\n")
+    monkeypatch.setenv("NOTIFY_SOCKET", path)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(path)
+        with running(tmp_path, "--config", str(file)) as daemon:
+            yield daemon
 
 
 @pytest.fixture(scope="module")

@@ -1,17 +1,16 @@
 """Faults of a film that begin when the tail has been learned and measured for a while."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
 
-from fishd.camera.tail.learned import Learned
 from fishd.camera.tail.meter import TailMeter
-from fishd.core.tail_reading import TailReading
 from rigs.filmed_tail import Film, FilmedTail, Knock, Thing, sine
-from rigs.measured_tail import CASES, WEB
+from rigs.measured_tail import CASES, WEB, learn
 
 LEARNED_S, BEGIN_S, END_S = 5.0, 6.0, 10.0
 """Times to which a film is learned, from which it has a fault, and at which it ends [s]."""
@@ -109,16 +108,23 @@ class Outcome(NamedTuple):
     """Time from the fault to the first reading that says that something has moved [s]."""
 
 
-def fail(learned: Learned, film: Film, fault: str, seed: int, until: float = END_S) -> Outcome:
+@cache
+def _measure_until_fault(film: Film) -> TailMeter:
+    meter = TailMeter(learn(film))
+    for shot in FilmedTail(film).shots(LEARNED_S, BEGIN_S):
+        meter.read(shot.time, shot.picture, film.read_out)
+    return meter
+
+
+def fail(film: Film, fault: str, seed: int, until: float = END_S) -> Outcome:
     """Return the outcome of a fault in a film, whose details are random, until a time [s]."""
     random = np.random.default_rng([seed, list(FAULTS).index(fault)])
     faulty = FAULTS[fault](film, random)
-    meter, readings = TailMeter(learned), list[TailReading]()
-    for part, begin, end in ((film, LEARNED_S, BEGIN_S), (faulty, BEGIN_S, until)):
-        readings = [
-            meter.read(shot.time, shot.picture, part.read_out)
-            for shot in FilmedTail(part).shots(begin, end)
-        ]
+    meter = deepcopy(_measure_until_fault(film))
+    readings = [
+        meter.read(shot.time, shot.picture, faulty.read_out)
+        for shot in FilmedTail(faulty).shots(BEGIN_S, until)
+    ]
     known = [reading for reading in readings if reading.alpha is not None]
     truth = faulty.motion(np.array([reading.time for reading in known]))
     wrong = [abs((r.alpha or 0.0) - t) >= WRONG_RAD for r, t in zip(known, truth, strict=True)]

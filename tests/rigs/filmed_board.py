@@ -34,13 +34,11 @@ class FilmedBoard:
             cv2.BORDER_CONSTANT,
             value=255,  # type: ignore[arg-type]
         )
-        self._board = cv2.resize(
-            drawn, None, fx=_FINE, fy=_FINE, interpolation=cv2.INTER_NEAREST
-        ).astype(np.float32)
+        self._board = cv2.resize(drawn, None, fx=_FINE, fy=_FINE, interpolation=cv2.INTER_NEAREST)
         self._straight = self._straighten()
 
     def _straighten(self) -> Floats:
-        """Return where each sample of the picture is seen by an ideal camera, from its centre."""
+        """Return where each pixel is seen by an ideal camera, from its centre."""
         film = self.film
         pixels = np.meshgrid(np.arange(film.width), np.arange(film.height))
         seen = (np.stack(pixels, axis=2) - self._centre) * (1.0, film.aspect)
@@ -48,7 +46,7 @@ class FilmedBoard:
         for _ in range(20):
             radius = np.linalg.norm(ideal, axis=2, keepdims=True) / math.hypot(*self._centre)
             ideal = seen / (1.0 + film.lens * radius**2)
-        return np.asarray(cv2.resize(ideal, None, fx=_SAMPLES, fy=_SAMPLES))
+        return ideal
 
     def picture(
         self, square: float, place: Floats, rotation: Floats, blur: float = 0.0
@@ -67,10 +65,10 @@ class FilmedBoard:
         to_picture = np.diag([width, width, 1.0]) @ np.column_stack([sides, corner])
         straight = self._straight.reshape(-1, 1, 2)
         board = cv2.perspectiveTransform(straight, np.linalg.inv(to_picture))
-        places = (board * MODULES + _MARGIN) * _FINE - 0.5
-        x, y = np.moveaxis(places.reshape(self._straight.shape), 2, 0).astype(np.float32)
+        places = ((board * MODULES + _MARGIN) * _FINE - 0.5).astype(np.float32)
+        samples = cv2.resize(places.reshape(self._straight.shape), None, fx=_SAMPLES, fy=_SAMPLES)
         fine = cv2.remap(
-            self._board, x, y, cv2.INTER_LINEAR,
+            self._board, samples, None, cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT, borderValue=film.water,
         )  # fmt: skip
         picture = cv2.resize(fine, (film.width, film.height), interpolation=cv2.INTER_AREA)

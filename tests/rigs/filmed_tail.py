@@ -223,20 +223,21 @@ class FilmedTail:
     def _outline(self, times: Floats) -> Floats:
         """Return the polygon (m, 2) in pixels of an ideal camera; corner k is seen at times[k]."""
         film = self.film
-        points = self.midline(
-            self.alpha(times), (self.alpha(times + 1e-3) - self.alpha(times)) / 1e-3
+        # Without a rolling shutter, all corners are seen at one moment.
+        moments, number = np.unique(times, return_inverse=True)
+        alpha = self.alpha(moments)
+        points = self.midline(alpha, (self.alpha(moments + 1e-3) - alpha) / 1e-3)
+        end = _STATIONS - 1
+        upper = np.minimum(np.arange(_STATIONS), round((1.0 - film.torn) * end))
+        place = np.concatenate([upper, upper[::-1]])
+        slope = (
+            points[number, np.minimum(place + 1, end)] - points[number, np.maximum(place - 1, 0)]
         )
-        slope = np.gradient(points, axis=1)
-        normal = np.stack([-slope[..., 1], slope[..., 0]], axis=2)
-        normal /= np.linalg.norm(normal, axis=2, keepdims=True)
-        along = np.linspace(0.0, 1.0, _STATIONS)
-        half = np.interp(along, [0.0, FIN_FROM, 1.0], film.half_thickness) / film.length
-        upper, lower = points + half[:, None] * normal, points - half[:, None] * normal
-        index = np.arange(_STATIONS)
-        place = np.minimum(index, round((1.0 - film.torn) * (_STATIONS - 1)))
-        outline = np.concatenate(
-            [upper[index, place], lower[2 * _STATIONS - 1 - index, place][::-1]]
-        )
+        normal = np.stack([-slope[:, 1], slope[:, 0]], axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        half = np.interp(place / end, [0.0, FIN_FROM, 1.0], film.half_thickness) / film.length
+        half[_STATIONS:] *= -1.0
+        outline = points[number, place] + half[:, None] * normal
         turn = np.array(
             [[math.cos(film.yaw), -math.sin(film.yaw)], [math.sin(film.yaw), math.cos(film.yaw)]]
         )
@@ -268,11 +269,11 @@ class FilmedTail:
         """Return the fraction of each pixel that the tail covers, and the place of that part."""
         film = self.film
         count = 1 if film.exposure <= 0.002 else 5
-        polygons = []
+        polygons, rows = [], np.full(2 * _STATIONS, 0.5 * film.height)
         for share in (np.arange(count) + 0.5) / count - 0.5:
             moment = time + share * film.exposure
-            rows = np.full(2 * _STATIONS, 0.5 * film.height)
-            for _ in range(3 if film.read_out else 1):
+            rounds = 2 if polygons else 3
+            for _ in range(rounds if film.read_out else 1):
                 times = moment + film.read_out * (rows / film.height - 0.5)
                 polygon = self._project(self._outline(times), moment)
                 rows = polygon[:, 1]
@@ -284,13 +285,15 @@ class FilmedTail:
         if right <= left or bottom <= top:
             return None
         shape = (bottom - top, right - left)
-        total = np.zeros(shape, np.float32)
+        total = np.zeros((SAMPLES * shape[0], SAMPLES * shape[1]), np.uint8)
+        level = 255 // count
         for polygon in polygons:
-            fine = np.zeros((SAMPLES * shape[0], SAMPLES * shape[1]), np.uint8)
+            fine = np.zeros_like(total)
             places = (polygon - (left, top) + 0.5) * SAMPLES - 0.5
-            cv2.fillPoly(fine, [np.rint(places * 256).astype(np.int32)], 255, shift=8)
-            total += cv2.resize(fine, shape[::-1], interpolation=cv2.INTER_AREA)
-        return int(left), int(top), total / np.float32(255 * count)
+            cv2.fillPoly(fine, [np.rint(places * 256).astype(np.int32)], level, shift=8)
+            cv2.add(total, fine, total)
+        covered = cv2.resize(total, shape[::-1], interpolation=cv2.INTER_AREA)
+        return int(left), int(top), covered / np.float32(255)
 
     def _make_floor(self) -> NDArray[np.float32]:
         """Return the floor, which does not move, with the fish's body."""

@@ -80,7 +80,9 @@ class FilmedFish:
             if self.tag is not None:
                 self._paint_tag(large, turn, (self.place(time) + 0.5) * fine - 0.5)
             picture = cv2.resize(large, size[::-1], interpolation=cv2.INTER_AREA)
-            yield np.clip(picture + 3.0 * noise.standard_normal(size), 0, 255).astype(np.uint8)
+            yield np.clip(picture + 3.0 * noise.standard_normal(size, np.float32), 0, 255).astype(
+                np.uint8
+            )
 
     def _paint_tag(
         self, large: NDArray[np.uint8], turn: NDArray[np.float64], place: NDArray[np.float64]

@@ -13,6 +13,9 @@ from rigs.window_process import NETWORK_HOST
 RESOLVED = f"--host-resolver-rules=MAP {NETWORK_HOST} 127.0.0.1"
 """Option of the browser, with which it opens the link of an invitation."""
 
+PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+"""Settings of a page on a phone."""
+
 expect.set_options(timeout=PATIENCE * 1e3)
 
 

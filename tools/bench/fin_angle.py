@@ -21,7 +21,7 @@ sys.path.append(str(DOCS.parent / "tests"))
 from rigs.faulty_films import FAULTS, FILMS, fail
 from rigs.filmed_board import calibrate
 from rigs.filmed_tail import FilmedTail
-from rigs.measured_tail import ASKED, ASKED_CALIBRATED, BENT, CASES, find_errors, learn
+from rigs.measured_tail import ASKED, ASKED_CALIBRATED, BENT, CASES, find_errors
 
 from fishd.camera.tail.learner import Learner
 from fishd.camera.tail.meter import TailMeter
@@ -101,8 +101,7 @@ def _measure_outcomes(case: tuple[str, int]) -> dict[str, tuple[float, float, fl
     """Return the outcome of each fault in a film."""
     cv2.setNumThreads(1)
     film = replace(FILMS[case[0]], seed=case[1])
-    learned = learn(film)
-    return {fault: tuple(fail(learned, film, fault, case[1])) for fault in FAULTS}  # type: ignore[misc]
+    return {fault: tuple(fail(film, fault, case[1])) for fault in FAULTS}  # type: ignore[misc]
 
 
 def _measure_film(case: tuple[str, bool, int]) -> list[float]:

@@ -72,7 +72,7 @@ class Scene:
             pose += change
         return pose, float(np.median(rest)) / max(first, 1e-6)
 
-    def undo(self, small: Floats | Pixels, pose: Array) -> Floats:
+    def undo(self, small: "Floats | Pixels", pose: Array) -> Floats:
         """Return a small picture as it would be without a pose of the camera."""
         c, s = math.cos(pose[2]), math.sin(pose[2])
         turn = np.array([[c, -s], [s, c]])

@@ -5,6 +5,7 @@ import shlex
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 from msgspec.structs import asdict
@@ -27,6 +28,9 @@ from fishd.recording.folder import (
 )
 from fishd.recording.part_file import SUFFIX
 from fishd.recording.reader import RECOVERED
+
+if TYPE_CHECKING:
+    from fishd.lab.run_traces import Traces
 
 
 def _choose_folder(context: click.Context, _: click.Parameter, folder: Path | None) -> Path:
@@ -147,9 +151,6 @@ def plot(
     Several runs are drawn over each other, each from the beginning of its swim; one without a
     recording is left out.
     """
-    from fishd.lab.run_figure import draw_run, draw_runs
-    from fishd.lab.run_traces import Traces, traces
-
     experiments = [_find_experiment(run, folder) for run in runs]
     if any(experiments) and (begin or end is not None):
         raise click.UsageError("--from and --until are for a recording, not an experiment")
@@ -158,11 +159,13 @@ def plot(
         _draw_experiment(experiment, path)
         print_paths([path], as_json)
         return
-    drawn: list[tuple[str, Traces]] = []
+    drawn = list[tuple[str, "Traces"]]()
     left_out, first = list[str](), None
     for run, experiment in zip(runs, experiments, strict=True):
         name = experiment.name if experiment else run.rpartition("/")[2].removesuffix(SUFFIX)
         if recording := _open_plotted(run, experiment, folder):
+            from fishd.lab.run_traces import traces  # takes long to load
+
             first = first or recording
             drawn.append((name, traces(recording, begin, math.inf if end is None else end)))
         else:
@@ -172,6 +175,8 @@ def plot(
     is_single = len(runs) == 1
     name = first.name if is_single else f"{first.name}-compared"
     path = _picture_path(target or first.path.parent, name, force)
+    from fishd.lab.run_figure import draw_run, draw_runs
+
     if is_single:
         draw_run(drawn[0][1], path)
     else:

@@ -14,7 +14,6 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 from msgspec import Meta, Struct
 from msgspec.structs import replace
-from scipy.optimize import brentq
 
 from fishd.config import Config
 from fishd.core import files
@@ -143,6 +142,8 @@ def _observed_order(grids: Sequence[GridSpeed]) -> float | None:
     def excess(order: float) -> float:
         sizes = (coarse.cell**order, middle.cell**order, fine.cell**order)
         return math.log((sizes[0] - sizes[1]) / (sizes[1] - sizes[2])) - math.log(first / second)
+
+    from scipy.optimize import brentq  # takes long to load, in each sweep
 
     low, high = 1e-3, 10.0
     if excess(low) > 0.0 or excess(high) < 0.0:

@@ -61,7 +61,7 @@ from fishd.learning.train.jobs import Job, Outcome
 from fishd.learning.train.progress import Display
 from fishd.learning.train.training import train
 from fishd.virtual.imperfections import SimulationSettings
-from fishd.virtual.plant.optimum import best_square_wave, square_wave
+from fishd.virtual.plant.optimum import best_square_wave, square_wave, swims_forwards
 from fishd.virtual.plant.parameters import PlantParameters
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def fit(
     plant = identified_fish(identification)
     model = model_of(identification)
     cloud = draw_cloud(identification, amplitude, seed)
-    if len(cloud) < MIN_CLOUD_SIZE or not best_square_wave(plant, amplitude).thrust > 0.0:
+    if len(cloud) < MIN_CLOUD_SIZE or not swims_forwards(plant, amplitude):
         model = replace(model, standard_error=None)
     offset, drift = identification["offset_y"], identification.channels[1].drift
     fitted = Fitted(
@@ -265,9 +265,7 @@ def draw_cloud(
             centre, identification.covariance, count - 1, method="eigh", check_valid="ignore"
         )
         drawn = (_fish(fitted, identification.names, z.tolist()) for z in draws)
-        fish += [
-            plant for plant in drawn if plant and best_square_wave(plant, amplitude).thrust > 0.0
-        ]
+        fish += [plant for plant in drawn if plant and swims_forwards(plant, amplitude)]
         if len(fish) >= count:
             break
     return tuple(fish[:count])

@@ -85,28 +85,46 @@ def best_square_wave(parameters: PlantParameters, amplitude: float) -> SteadySta
     refinement. The maximum at ω₀/2π is narrow, hence that frequency is one point of the scan.
     Without damping, the thrust there is unbounded, and rounding limits the result.
     """
+    scan = _scan(parameters, amplitude)
+    thrust = _thrust_of_waves(parameters, amplitude)
+    logs = [math.log(frequency) for frequency in scan]
+    thrusts = [thrust(frequency, _SCAN_TOLERANCE) for frequency in scan]
+    best = min(max(thrusts.index(max(thrusts)), 1), len(logs) - 2)
+    log = _find_maximum(lambda x: thrust(math.exp(x)), logs[best - 1], logs[best + 1])
+    return square_wave(parameters, amplitude, math.exp(log))
+
+
+def swims_forwards(parameters: PlantParameters, amplitude: float) -> bool:
+    """Return whether a square wave of this amplitude (rad) has a thrust above zero.
+
+    Unlike the best square wave, this mostly needs one frequency.
+    """
+    thrust = _thrust_of_waves(parameters, amplitude)
+    scan = reversed(_scan(parameters, amplitude))  # high ones are simulated faster
+    return any(thrust(frequency, _SCAN_TOLERANCE) > 0.0 for frequency in scan)
+
+
+def _scan(parameters: PlantParameters, amplitude: float) -> list[float]:
+    """Return frequencies of which one is near the best, in order [Hz]."""
     p = parameters
     resonance = p.omega0 / (2.0 * math.pi)
     saturated = p.servo_speed / (4.0 * amplitude)
     lowest = min(resonance, saturated) / _SCAN_FACTOR_BELOW
-    scan = sorted(
+    return sorted(
         [resonance, *np.geomspace(lowest, _SCAN_FACTOR_ABOVE * resonance, _SCAN_POINTS).tolist()]
     )
 
-    simulated_fish = None if _is_linear(p) else _SimulatedFish(p, amplitude)
 
-    def thrust(log_frequency: float, precision: float = _THRUST_TOLERANCE) -> float:
-        frequency = math.exp(log_frequency)
-        if simulated_fish:
-            return simulated_fish.simulate(frequency, precision).thrust
-        return _half_period(p, amplitude, frequency).thrust
+def _thrust_of_waves(parameters: PlantParameters, amplitude: float) -> Callable[..., float]:
+    """Return the function that returns the thrust [N] of a frequency [Hz], to a precision."""
+    fish = None if _is_linear(parameters) else _SimulatedFish(parameters, amplitude)
 
-    logs = [math.log(frequency) for frequency in scan]
-    thrusts = [thrust(x, _SCAN_TOLERANCE) for x in logs]
-    best = min(max(thrusts.index(max(thrusts)), 1), len(logs) - 2)
-    return square_wave(
-        p, amplitude, math.exp(_find_maximum(thrust, logs[best - 1], logs[best + 1]))
-    )
+    def thrust(frequency: float, precision: float = _THRUST_TOLERANCE) -> float:
+        if fish:
+            return fish.simulate(frequency, precision).thrust
+        return _half_period(parameters, amplitude, frequency).thrust
+
+    return thrust
 
 
 def _is_linear(parameters: PlantParameters) -> bool:

@@ -10,6 +10,7 @@ import { Drive, driverName, request } from "./controls.js";
 import { Experiments, plain, titleOf, triedThrust } from "./experiments.js";
 import { defaultOf } from "./fields.js";
 import { TopView } from "./fish.js";
+import { QueueLine } from "./queue.js";
 import { Ring, ticksOf } from "./ring.js";
 import { Runs } from "./runs.js";
 import { Stream } from "./stream.js";
@@ -362,7 +363,7 @@ function Head() {
   const driver = lease ? `${lease.name} drives` : state.driver ? (state.driver.you_drive ? "you drive" : `${driverName(state)} drives`) : "no driver";
   return html`
     ${state.fish.length > 1
-      ? html`<nav class="tabs" aria-label="Fish"><h1 class="unseen">${state.name}</h1>${state.fish.map((name) => html`<a href=${`?fish=${encodeURIComponent(name)}`}
+      ? html`<nav class="tabs" aria-label="Fish"><h1 class="unseen">${state.name}</h1>${state.fish.map((name) => html`<a href=${`?fish=${encodeURIComponent(name)}#${state.place}`}
           aria-current=${name === state.name ? "page" : undefined}>${name}</a>`)}</nav>`
       : html`<h1>${shownName() || "fishd"}</h1>`}
     ${kind !== "not paired" && html`<span class=${`pill mode ${mode}`} id="mode">${kind === "lost" && state.status ? `was ${modeText}` : modeText}</span>`}
@@ -476,7 +477,7 @@ function renderAll() {
   render(state.place === "fish" && state.name ? html`<${About} fish=${state.name} isPaired=${state.session?.paired} act=${act}
     mayRestart=${state.session?.scope === "drive" && state.status?.mode !== "running"} />` : null, byId("about"));
   render(html`<${Banner} />`, byId("banner"));
-  render(html`<${Drive} ...${shared} />`, byId("drive"));
+  render(html`<${Drive} ...${shared}><${QueueLine} page=${shared} /><//>`, byId("drive"));
   render(html`<${ChartTools} ...${{ charts, shownName }} />`, byId("chart-head"));
   render(charts.cursor !== null && html`<${MarkForm} ...${{ charts, state, act }} />`, byId("chart-foot"));
   render(html`<${Experiments} ...${shared} />`, byId("experiments"));
@@ -557,10 +558,11 @@ function followAddress() {
     history.replaceState(null, "", location.pathname + location.search);
   }
   if (location.hash === "#camera") state.isCameraOpen = true; // from `fishctl camera page`
-  const place = PLACES[location.hash.slice(1)] ? location.hash.slice(1) : "live";
+  const place = PLACES[location.hash.slice(1)] ? location.hash.slice(1) : "live", isOther = state.place && state.place !== place;
   state.place = place;
   for (const section of byId("main").children) section.hidden = !section.dataset.places.split(" ").includes(place);
   byId("main").dataset.place = place;
+  if (isOther) scrollTo(0, 0); // not as far down as the part before
   changed();
 }
 

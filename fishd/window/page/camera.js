@@ -1,5 +1,5 @@
 // The camera's picture with the measured tail and the axis of motion, while the tile is open and on the screen.
-import { html, number, recall, remember, sentence, useEffect, useRef, useState } from "./common.js";
+import { html, interval, number, recall, remember, sentence, useEffect, useRef, useState } from "./common.js";
 
 const RETRY_MS = 2000;
 /** Colours of what is drawn into the picture, which is grey in light and dark. */
@@ -26,7 +26,7 @@ export function Camera({ fish, close }) {
     <div class=${`camera ${facts.is_lost ? "old" : ""}`}>
       <canvas ref=${canvas} width="4" height="3" role="img" aria-label="What the camera sees, with the measured tail"></canvas>
       <div><p role="status" class=${facts.is_lost ? "note" : "summary"}>${sentence(facts.title)}</p>
-        ${facts.lines?.map((line) => html`<p class="muted">${sentence(line)}</p>`)}
+        ${facts.lines?.map((line) => html`<p class="muted">${sentence(line).replace(/ -(?=\d)/g, " −")}</p>`)}
         ${aligns && !facts.is_lost && html`<p class="muted">${facts.axis
           ? `The axis is ${number(facts.axis[0], 1)} px below the middle row of what frames show, tilted by ${number(facts.axis[1] * 180 / Math.PI, 1)}°.`
           : "The axis is not known yet: let the tail move for some seconds."}</p>
@@ -128,7 +128,7 @@ class Link {
     }
     path(midline.map(([x, y]) => [(x + 0.5) / columns, (y + 0.5) / rows]), TAIL);
     if (alpha === null && !reason) return;
-    const text = [alpha !== null && `α ${number(alpha, 3)}${uncertainty === null ? "" : ` ± ${number(uncertainty, 3)}`} rad`, reason].filter(Boolean).join(", ");
+    const text = [alpha !== null && `α ${uncertainty === null ? number(alpha, 3) : interval(alpha, uncertainty).join(" ")} rad`, reason].filter(Boolean).join(", ");
     Object.assign(context, { font: `600 ${13 * devicePixelRatio}px system-ui, sans-serif`, textBaseline: "bottom", lineWidth: 4 * devicePixelRatio, strokeStyle: "#000", fillStyle: "#fff" });
     context.setLineDash([]);
     const place = [text, 8 * devicePixelRatio, height - 6 * devicePixelRatio];

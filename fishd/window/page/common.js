@@ -1,4 +1,6 @@
 // What all modules share: the template function, numbers as text, and requests to the server.
+import { html } from "./vendor/htm-preact-standalone-3.1.1.js";
+
 export { html, render, useEffect, useLayoutEffect, useMemo, useRef, useState } from "./vendor/htm-preact-standalone-3.1.1.js";
 
 const NBSP = "\u00a0";
@@ -20,13 +22,19 @@ export function significant(value, digits = 3) {
   return number(value, decimals);
 }
 
-/** Return value and half-width of its interval, rounded to two digits of the half-width. */
+/** Return the decimals that show two digits of the smallest number, but not more than five of the largest. */
+export function decimalsFor(smallest, largest) {
+  const place = (x) => Math.floor(Math.log10(x));
+  return Math.min(8, Math.max(0, Math.min(1 - place(smallest), 4 - place(largest))));
+}
+
+/** Return value and half-width of its interval, with the same decimals. */
 export function interval(value, halfWidth) {
   if (!Number.isFinite(value)) return ["–", ""];
   if (!Number.isFinite(halfWidth) || halfWidth < 0) return [significant(value), `±${NBSP}?`];
   if (halfWidth <= 1e-6 * Math.abs(value)) return [significant(value, 4), "(exact)"];
-  const decimals = Math.min(8, Math.max(0, 1 - Math.floor(Math.log10(halfWidth))));
-  return [number(value, decimals), `±${NBSP}${number(halfWidth, decimals)}`];
+  const decimals = decimalsFor(halfWidth, Math.max(halfWidth, Math.abs(value)));
+  return [number(value, decimals), `±${NBSP}${number(Math.max(halfWidth, 10 ** -decimals), decimals)}`];
 }
 
 /** Return factor and name of the unit in which forces are shown: mN for newtons. */
@@ -38,10 +46,10 @@ export function forceUnit(status) {
 /** Return the text of a unit; a pure number has none. */
 export const unitText = (unit) => (unit && unit !== "1" ? unit : "");
 
-/** Return a duration such as "0.8 s", "12 s", "3 min". */
-export function duration(seconds) {
+/** Return a duration such as "0.8 s", "12 s", "3 min"; a rough one has decimals below a second only. */
+export function duration(seconds, isRough = false) {
   if (!Number.isFinite(seconds)) return "–";
-  if (seconds < 9.95) return `${seconds.toFixed(1)}${NBSP}s`;
+  if (seconds < (isRough ? 0.95 : 9.95)) return `${seconds.toFixed(1)}${NBSP}s`;
   if (seconds < 120) return `${seconds.toFixed(0)}${NBSP}s`;
   if (seconds < 7200) return `${(seconds / 60).toFixed(0)}${NBSP}min`;
   return `${(seconds / 3600).toFixed(1)}${NBSP}h`;
@@ -75,7 +83,11 @@ export function controllerText(name, parameters) {
 }
 
 /** Quote a word as a shell needs it. */
-export const quote = (word) => (/^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`);
+const quote = (word) => (/^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`);
+
+/** A command line, which is broken between its words. */
+export const Command = ({ words, label = "Command line" }) => html`<code tabindex="0" aria-label=${label}>${
+  words.map((word) => html`<span>${quote(word)}</span> `)}</code>`;
 
 /** An answer of the server that is not the result. */
 export class Refusal extends Error {

@@ -4,7 +4,7 @@ import { Field, missingOf, selectionOf, shownParameters } from "./fields.js";
 
 const SEND_MS = 150;
 
-export function Drive({ state, act, changed, changeRole, experiment }) {
+export function Drive({ state, act, changed, changeRole, experiment, children }) {
   const timer = useRef(0);
   const [text, setText] = useState("");
   const { controller, edited, applied, running } = selectionOf(state);
@@ -51,6 +51,7 @@ export function Drive({ state, act, changed, changeRole, experiment }) {
     ${!mayDrive && html`<p class="note">This device may only watch and use the E‑stop.</p>`}
     ${experiment && html`<p class="note">The experiment <b>${experiment.name}</b> (process ${experiment.pid}${experiment.host && ` on ${experiment.host}`})
       holds the fish.${mayDrive && " Stop ends it."}</p>`}
+    ${children}
     ${mayDrive && html`<div class="role">
       <span>${other ? html`<b>${driverName(state).replace(/^another page$/, "Another page")}</b> drives` : state.driver ? "You drive" : "No page drives"}</span>
       ${state.driver?.you_drive

@@ -1,5 +1,5 @@
 // Experiments as child processes of the server: a form, and the jobs with the command line that each ran.
-import { call, controllerText, duration, forceUnit, html, interval, number, quote, recall, remember, sentence, useEffect, useState } from "./common.js";
+import { call, Command, controllerText, duration, forceUnit, html, interval, number, recall, remember, sentence, useEffect, useState } from "./common.js";
 import { Curve } from "./curve.js";
 import { defaultOf, missingOf, selectionOf, shownParameters } from "./fields.js";
 import { CHECK_TIMEOUT_MS, enteredOptions, Fields, fieldsOf, useCheck, valueOf, Varied } from "./forms.js";
@@ -137,7 +137,7 @@ function Experiment({ page, form, entry, set }) {
         ${hasNothing ? html`<p class="muted">${controller.name} has no ${isRange ? "number to search" : "parameter to vary"}: choose another controller.</p>`
           : needed.length ? html`<p class="muted">Needed first, in the panel Controller: ${needed.map(({ name }) => name).join(", ")}.</p>`
           : isReady && problem ? html`<p class="note">${sentence(problem)}</p>`
-            : isReady && command.length > 0 && html`<code tabindex="0" aria-label="Command line to come">${command.map(quote).join(" ")}</code>
+            : isReady && command.length > 0 && html`<${Command} words=${command} label="Command line to come" />
               ${plan && html`<p class="muted">${planText(plan, form, entered)}</p>`}`}
       </div>
       <div class="buttons">
@@ -152,7 +152,7 @@ function Experiment({ page, form, entry, set }) {
 /** Return how long an experiment takes, as its verb says. */
 function planText({ amount, unit, seconds }, form, entered) {
   const takes = `Takes ${form.fields.some(({ name }) => name === "budget") ? "at most" : "about"}`;
-  if (seconds !== null) return `${takes} ${duration(seconds)}.`;
+  if (seconds !== null) return `${takes} ${duration(seconds, true)}.`;
   const isVirtual = fieldsOf(form, entered).some((field) => field.name === "on" && valueOf(field, entered) === "simulation");
   return `${takes} ${+amount.toFixed(1)} ${unit}${isVirtual && unit.startsWith("s") && unit !== "steps" ? ", in virtual time" : ""}.`;
 }
@@ -183,12 +183,12 @@ function Job({ job, state, notice, mayDrive, resume }) {
   const ask = (what) => () => call("POST", `/api/jobs/${job.id}/${what}`).catch((error) => notice("error", error.message, error.remedy));
   return html`<li class=${`job ${job.state}`}>
     <div class="job-head"><b>${title}</b><span class="pill small">${job.state}</span>
-      <span class="muted">${job.state === "lost" ? "" : duration(elapsed)}${runs && left ? `, ${left}` : ""}</span>
+      <span class="muted">${duration(elapsed)}${runs && left ? `, ${left}` : ""}</span>
       <span class="buttons">${runs && html`<button type="button" disabled=${!mayDrive} onClick=${ask("stop")}>Stop</button>`}
         ${job.resumable && html`<button type="button" disabled=${!mayDrive} onClick=${resume}>Resume</button>`}
         ${!runs && html`<button type="button" disabled=${!mayDrive} aria-label=${`Dismiss ${job.kind}`} onClick=${ask("dismiss")}>Dismiss</button>`}</span></div>
     ${runs && html`<${Progress} job=${job} elapsed=${elapsed} />`}
-    <code tabindex="0" aria-label="Command line">${job.command.map(quote).join(" ")}</code>
+    <${Command} words=${job.command} />
     ${hasAnswer ? html`${doing && html`<p class="result">${sentence(doing)}</p>`}<${Estimates} estimates=${estimates} title="result" />` : html`<${Result} job=${job} status=${state.status} />`}
     <${Growing} points=${job.points} />
     ${(job.state !== "done" || job.exit !== 0) && !(job.state === "stopped" && job.result) && job.lines?.length > 0 && html`<p class="last">${plain(job.lines.at(-1))}</p>`}

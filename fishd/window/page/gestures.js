@@ -3,8 +3,9 @@ const TAP_PX = 6;
 export const ZOOM = 1.5;
 const PAN = 0.2, WHEEL_ZOOM = 0.0025;
 
-const middle = (xs) => (Math.min(...xs) + Math.max(...xs)) / 2;
-const spread = (xs) => Math.max(...xs) - Math.min(...xs);
+const middle = (points) => points.reduce((sum, { x }) => sum + x, 0) / points.length;
+/** Return the distance of two fingers, in whatever direction; 0 for one. */
+const spread = ([a, b]) => (b ? Math.hypot(a.x - b.x, a.y - b.y) : 0);
 
 /**
  * Follow the pointers over an element: drag to pan, two fingers or Ctrl with the wheel to zoom, and taps.
@@ -12,20 +13,22 @@ const spread = (xs) => Math.max(...xs) - Math.min(...xs);
  */
 export function followPointers(node, { pan, zoom, tap }) {
   const pointers = new Map();
-  let travelled = 0;
+  let travelled = 0, start = null;
   const fractionAt = (x) => Math.min(1, Math.max(0, (x - node.getBoundingClientRect().left) / node.clientWidth));
   node.addEventListener("pointerdown", (event) => {
     if (event.button !== 0) return;
-    if (pointers.size === 0) travelled = 0;
-    pointers.set(event.pointerId, event.clientX);
+    if (pointers.size === 0) [travelled, start] = [0, event];
+    pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
     node.setPointerCapture(event.pointerId);
   });
-  node.addEventListener("pointermove", ({ pointerId, clientX }) => {
+  node.addEventListener("pointermove", ({ pointerId, clientX: x, clientY: y, pointerType }) => {
     if (!pointers.has(pointerId)) return;
-    const before = [...pointers.values()];
-    travelled += Math.abs(clientX - pointers.get(pointerId));
-    const after = [...pointers.set(pointerId, clientX).values()];
-    if (travelled <= TAP_PX) return;
+    const before = [...pointers.values()], { x: from, y: above } = pointers.get(pointerId);
+    travelled += Math.hypot(x - from, y - above);
+    const after = [...pointers.set(pointerId, { x, y }).values()];
+    // A finger that goes up or down scrolls the page, which the browser begins a little later.
+    const scrolls = pointerType === "touch" && after.length === 1 && Math.abs(y - start.clientY) > Math.abs(x - start.clientX);
+    if (travelled <= TAP_PX || scrolls) return;
     if (spread(before) > 0 && spread(after) > 0) zoom(spread(before) / spread(after), fractionAt(middle(after)));
     pan((middle(before) - middle(after)) / node.clientWidth);
   });

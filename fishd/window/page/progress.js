@@ -1,12 +1,12 @@
 // The progress of an experiment: how much is done, the best values until now, and their curve.
-import { duration, forceUnit, html, interval, number, significant, sentence, unitText } from "./common.js";
+import { decimalsFor, duration, forceUnit, html, interval, number, significant, sentence, unitText } from "./common.js";
 import { Points } from "./points.js";
 
 /** Return factor and name of the unit in which a quantity is shown: mN for newtons, as everywhere on the page. */
 const shownUnit = (unit) => (unit === "N" ? forceUnit({ force_unit: "N" }) : [1, unitText(unit)]);
 
-/** Return a value with its interval, as texts. */
-function textsOf({ value, low, high, unit }) {
+/** Return a value with its unit, and its interval, as texts. */
+export function textsOf({ value, low, high, unit }) {
   const [factor, name] = shownUnit(unit);
   if (low == null || high == null) return [`${significant(value * factor, 4)} ${name}`, ""];
   const half = (high - low) / 2 * factor;
@@ -15,7 +15,7 @@ function textsOf({ value, low, high, unit }) {
     return [`${middle} ${name}`, error];
   }
   const shown = [value, low, high].map((x) => x * factor), least = Math.min(...shown.map(Math.abs).filter((x) => x > half / 1000));
-  const decimals = Math.min(6, Math.max(0, half > 0 ? 1 - Math.floor(Math.log10(least)) : 3));
+  const decimals = half > 0 ? decimalsFor(Math.min(half, least), Math.max(...shown.map(Math.abs))) : 3;
   const [middle, ...ends] = shown.map((x) => number(x, decimals));
   return [`${middle} ${name}`, `[${ends.join(", ")}]`];
 }
@@ -38,11 +38,11 @@ export function Growing({ points }) {
 export function shareOf({ progress, plan }, elapsed) {
   if (progress) {
     const { fraction, remaining } = progress;
-    return [fraction, Number.isFinite(remaining) && fraction < 1 ? `about ${duration(remaining)} left` : ""];
+    return [fraction, Number.isFinite(remaining) && fraction < 1 ? `about ${duration(remaining, true)} left` : ""];
   }
   const total = plan?.seconds;
   if (!total) return [null, ""];
-  return elapsed > total ? [null, "soon at its end"] : [elapsed / total, `of about ${duration(total)}`];
+  return elapsed > total ? [null, "soon at its end"] : [elapsed / total, `of about ${duration(total, true)}`];
 }
 
 /** What is known of an experiment while it runs. */

@@ -1,11 +1,12 @@
 // The queue of experiments of this fish: what runs, what waits, how long it takes. `fishctl queue` shows the same.
-import { call, duration, html, numberIn, quote, sentence, useEffect, useState } from "./common.js";
+import { call, Command, duration, html, numberIn, sentence, useEffect, useState } from "./common.js";
 import { startJob } from "./experiments.js";
 import { Text } from "./fields.js";
 import { Growing, Progress } from "./progress.js";
 import { CHECK_TIMEOUT_MS } from "./forms.js";
 
-const POLL_MS = 2000;
+/** Pause between two questions about the queue, by the part of the page that is shown. */
+const POLL_MS = { experiments: 2000, live: 5000 };
 const clock = new Intl.DateTimeFormat([], { hour: "2-digit", minute: "2-digit", hourCycle: "h23" });
 const timeText = (t) => clock.format(new Date(t * 1000));
 
@@ -53,22 +54,35 @@ function nextTime(text) {
   return when / 1000;
 }
 
+/** What the queue does, and what comes next, in a line for the part Live; nothing while it is empty. */
+export function QueueLine({ page }) {
+  const { queue, session, place } = page.state, { items = [], current, pauses } = queue ?? {};
+  if (place !== "live" || items.length === 0) return null;
+  const item = items.find(({ id }) => id === current), next = item?.repeat > 1 ? item : items.find(({ id }) => id !== current);
+  const name = ({ words }) => html`<b>${words.filter((word) => word !== "--on=live").join(" ")}</b>`;
+  return html`<div class="role with" id="queue-line"><span>Queue: ${!item ? `${queue.state}, ${items.length} in it.`
+      : html`${name(item)}, ${pauses ? "then it pauses." : next ? html`then ${name(next)}.` : "the last one."}`}</span>
+    ${item ? html`<button type="button" disabled=${session?.scope !== "drive"}
+      onClick=${() => change(page, pauses ? "cancel-pause" : "pause")}>${pauses ? "Do not pause" : "Pause after it"}</button>`
+      : html`<a class="link" href="#experiments">Show</a>`}</div>`;
+}
+
 export function Queue({ page }) {
   const { state } = page, { queue } = state;
-  const isShown = state.place === "experiments" && Boolean(state.session?.paired) && Boolean(state.name);
+  const isShown = state.place in POLL_MS && Boolean(state.session?.paired) && Boolean(state.name);
   useEffect(() => {
     if (!isShown) return undefined;
     let timer, isOver = false;
     const poll = async () => {
       if (!document.hidden) await ask(page);
-      if (!isOver) timer = setTimeout(poll, POLL_MS);
+      if (!isOver) timer = setTimeout(poll, POLL_MS[state.place]);
     };
     poll();
     return () => {
       isOver = true;
       clearTimeout(timer);
     };
-  }, [isShown, state.name]);
+  }, [isShown, state.place, state.name]);
   if (!queue?.items) return html`<h3 class="queue-title">Queue</h3><p class="muted">${queue ? sentence(queue.failure) : "Loading …"}</p>`;
   const mayDrive = state.session?.scope === "drive", isRunning = queue.state === "running";
   const passed = isRunning && queue.current !== null ? (performance.now() - queue.received) / 1000 : 0;
@@ -83,7 +97,7 @@ export function Queue({ page }) {
   };
   return html`<section class="queue" aria-labelledby="queue-title">
     <div class="head-row"><h3 class="queue-title" id="queue-title">Queue <span class=${`pill small ${queue.state}`}>${queue.state}</span></h3>
-      ${queue.items.length > 0 && html`<span class="muted">${queue.items.length} in it, ${about} ${duration(left)}, until ${timeText(Date.now() / 1000 + left)} ${
+      ${queue.items.length > 0 && html`<span class="muted">${queue.items.length} in it, ${about} ${duration(left, true)}, until ${timeText(Date.now() / 1000 + left)} ${
         isRunning ? "" : "if it starts now"}</span>`}</div>
     ${queue.failure && html`<p class="note">${sentence(queue.failure)}</p>`}
     ${queue.state === "paused" && queue.reason && html`<p class="note">${sentence(`It pauses: ${queue.reason}`)} What was interrupted is resumed at the next start.</p>`}
@@ -108,7 +122,7 @@ export function Queue({ page }) {
 /** job: the runner that this page knows, with the progress of the experiment that runs */
 function Item({ item, place, queue, mayDrive, passed, send, job }) {
   const runs = item.id === queue.current, number = { number: item.id }, words = item.words.join(" ");
-  const elapsed = queue.elapsed + passed, each = item.seconds === null ? "" : duration(item.seconds);
+  const elapsed = queue.elapsed + passed, each = item.seconds === null ? "" : duration(item.seconds, true);
   const waits = item.run ? "interrupted, is resumed" : "waits";
   const what = runs ? `runs, ${duration(elapsed)}${each && ` of about ${each}`}` : `${waits}${each && `, about ${each} each`}`;
   const button = (text, label, action, isOff) => html`<button type="button" aria-label=${`${label} ${words}`} title=${label}
@@ -121,6 +135,6 @@ function Item({ item, place, queue, mayDrive, passed, send, job }) {
       ${button("↓", "Move down", send("move", { ...number, position: place + 2 }), place === queue.items.length - 1)}
       ${button("Remove", "Remove", send("remove", number), runs)}</span></div>
     ${runs && job?.progress ? html`<${Progress} job=${job} />` : runs && item.seconds !== null && html`<progress max=${item.seconds} value=${Math.min(elapsed, item.seconds)} aria-label=${`Progress of ${words}`}></progress>`}
-    <code tabindex="0" aria-label="Command line">fishctl ${item.words.map(quote).join(" ")}</code>
+    <${Command} words=${["fishctl", ...item.words]} />
     ${runs && html`<${Growing} points=${job?.points} />`}</li>`;
 }

@@ -1,17 +1,7 @@
 // Results of runs with their intervals, side by side, and pictures that the server draws.
-import { call, fetchPicture, html, interval, sentence, significant, unitText, useEffect, useMemo, useState } from "./common.js";
-import { Rows } from "./rows.js";
-
-/** Quantities of results: title, factor from SI units, and unit. */
-const QUANTITIES = {
-  thrust: ["thrust", 1e3, "mN"],
-  speed: ["speed", 1e3, "mm/s"],
-  frequency: ["frequency", 1, "Hz"],
-  power: ["power", 1e3, "mW"],
-  thrust_per_watt: ["efficiency", 1e3, "mN/W"],
-  relative_thrust: ["of the best square wave", 100, "%"],
-  fin_angle_max: ["largest fin angle", 1e3, "mrad"],
-};
+import { call, fetchPicture, html, interval, sentence, significant, useEffect, useMemo, useRef, useState } from "./common.js";
+import { textsOf } from "./progress.js";
+import { QUANTITIES, quantityOf, Rows } from "./rows.js";
 
 const queryOf = (runs) => new URLSearchParams(runs.map((run) => ["run", run]));
 
@@ -29,19 +19,21 @@ export function useResults(runs) {
 
 /** Return the tables of several runs as one, with their common columns and the runs as groups; null without a table. */
 function joinTables(results) {
-  const tables = results.filter(({ labels }) => labels.length > 1);
+  const tables = results.filter(({ labels, force_unit: unit }, _, [first]) => labels.length > 1 && unit === first.force_unit);
   const names = Object.keys(tables[0]?.columns ?? {}).filter((name) => tables.every(({ columns }) => name in columns));
   if (names.length < 2) return null;
   const columns = Object.fromEntries(names.map((name) => [name, tables.flatMap((table) => table.columns[name])]));
   const labels = tables.flatMap(({ name, labels: own }) => own.map((label) => (new Set(own).size > 1 ? `${name}: ${label}` : name)));
-  return { columns, labels, name: "the runs" };
+  return { columns, labels, name: "the runs", force_unit: tables[0].force_unit };
 }
 
 /** Runs side by side: a table of their results, their rows in one chart, and the traces of recordings over each other. */
 export function Comparison({ runs, close }) {
   const [results, failure] = useResults(runs);
   const joined = useMemo(() => results && joinTables(results), [results]);
-  return html`<section class="comparison" aria-label="Comparison">
+  const node = useRef(null);
+  useEffect(() => node.current.scrollIntoView(), []); // the runs may be picked far below
+  return html`<section class="comparison" aria-label="Comparison" ref=${node}>
     <div class="head-row"><h3>Comparison</h3><button type="button" onClick=${close}>Close comparison</button></div>
     ${failure ? html`<p class="note">${sentence(failure)}</p>` : results ? html`<${Results} results=${results} />` : html`<p class="muted">Loading …</p>`}
     ${joined && html`<${Rows} result=${joined} />`}
@@ -54,9 +46,8 @@ export function Results({ results }) {
   const several = results.length > 1;
   const text = (name, { values, result }) => {
     if (!values[name]) return "–";
-    const [, factor, unit] = QUANTITIES[name], [value, half] = values[name];
-    const own = name.startsWith("thrust") ? unit.replace("N", result.force_unit) : unit;
-    return name === "relative_thrust" ? `${significant(value * factor, 4)} %` : `${interval(value * factor, half == null ? NaN : half * factor).join(" ")} ${own}`;
+    const [, factor, unit] = quantityOf(name, result.force_unit), [value, half] = values[name];
+    return unit === "%" && half == null ? `${significant(value * factor, 4)} %` : `${interval(value * factor, half == null ? NaN : half * factor).join(" ")} ${unit}`;
   };
   return html`
     ${names.length > 0 && html`<div class="scroll" tabindex="0" role="region" aria-label="Results"><table class="results">
@@ -65,9 +56,10 @@ export function Results({ results }) {
         ${names.map((name) => html`<td class="right">${text(name, row)}</td>`)}</tr>`)}</tbody></table></div>`}
     ${results.map(({ name, summary, estimates }) => html`
       ${summary && html`<p>${several && html`<b>${name}</b>: `}${sentence(summary)}</p>`}
-      ${estimates.length > 0 && html`<ul class="estimates">${estimates.map(([parameter, value, low, high, unit]) => html`<li>${several && `${name}: `}<b>${parameter}</b>
-        ${" "}${significant(value, 4)} ${unitText(unit)} <span class="muted">${low === null || high === null ? "interval unknown"
-          : `${significant(low, 4)} to ${significant(high, 4)}`}</span></li>`)}</ul>`}`)}`;
+      ${estimates.length > 0 && html`<ul class="estimates">${estimates.map(([parameter, value, low, high, unit]) => {
+        const [middle, error] = textsOf({ value, low, high, unit });
+        return html`<li>${several && `${name}: `}<b>${parameter}</b> ${middle} <span class="muted">${error || "interval unknown"}</span></li>`;
+      })}</ul>`}`)}`;
 }
 
 /** A picture that the server may have to draw first. */

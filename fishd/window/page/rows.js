@@ -3,23 +3,35 @@ import { html, useLayoutEffect, useRef, useState } from "./common.js";
 
 const HEIGHT = 220;
 const COLOURS = ["thrust", "phi", "fy", "fin", "alpha", "fx"];
-/** Columns that are drawn in thousandths of their unit. */
-const MILLI = ["thrust", "speed", "power", "thrust_per_watt"];
+/** Quantities of results: title, factor from SI units, and unit. */
+export const QUANTITIES = {
+  thrust: ["thrust", 1e3, "mN"],
+  speed: ["speed", 1e3, "mm/s"],
+  frequency: ["frequency", 1, "Hz"],
+  power: ["power", 1e3, "mW"],
+  thrust_per_watt: ["efficiency", 1e3, "mN/W"],
+  relative_thrust: ["of the best square wave", 100, "%"],
+  fin_angle_max: ["largest fin angle", 1e3, "mrad"],
+};
 
-const titleOf = (name) => (MILLI.includes(name) ? `${name} (× 10⁻³)` : name.replace(/^parameters\./, ""));
+/** Return title, factor and unit of a quantity, or of another column; forces are in the unit of the sensor. */
+export function quantityOf(name, forceUnit = "N") {
+  const [title, factor, unit] = QUANTITIES[name] ?? [name.replace(/^parameters\./, "").replaceAll("_", " "), 1, ""];
+  return [title, factor, name.startsWith("thrust") ? unit.replace("N", forceUnit) : unit];
+}
 
-export function Rows({ result: { columns, labels, name: run } }) {
+export function Rows({ result: { columns, labels, name: run, force_unit: forceUnit } }) {
   const names = Object.keys(columns).filter((name) => !name.endsWith("_ci95")), node = useRef(null);
   const varied = names.filter((name) => new Set(columns[name]).size > 1);
   const [x, setX] = useState(varied[0] ?? names[0]);
   const [y, setY] = useState(["thrust", "speed"].find((name) => names.includes(name)) ?? names.at(-1));
   const groups = [...new Set(labels)];
   useLayoutEffect(() => {
-    const factor = MILLI.includes(y) ? 1e3 : 1, half = columns[`${y}_ci95`] ?? [];
+    const [, factor] = quantityOf(y), [, scale] = quantityOf(x), half = columns[`${y}_ci95`] ?? [];
     const order = columns[x].map((_, row) => row).filter((row) => columns[x][row] !== null && columns[y][row] !== null)
       .sort((a, b) => columns[x][a] - columns[x][b]);
     const scaled = (column, row) => (column[row] == null ? null : factor * column[row]);
-    const data = [order.map((row) => columns[x][row]),
+    const data = [order.map((row) => scale * columns[x][row]),
       ...groups.map((group) => order.map((row) => (labels[row] === group ? scaled(columns[y], row) : null)))];
     const style = getComputedStyle(document.documentElement), colour = (name) => style.getPropertyValue(`--${name}`);
     const axis = { stroke: () => colour("muted"), font: "11px system-ui, sans-serif", ticks: { show: false }, grid: { stroke: () => colour("grid"), width: 1 } };
@@ -55,6 +67,10 @@ export function Rows({ result: { columns, labels, name: run } }) {
       plot.destroy();
     };
   }, [columns, x, y]);
+  const titleOf = (name) => {
+    const [title, , unit] = quantityOf(name, forceUnit);
+    return unit ? `${title} [${unit}]` : title;
+  };
   const choose = (label, value, set) => html`<label>${label} <select value=${value} onChange=${(event) => set(event.target.value)}>
     ${names.map((name) => html`<option value=${name}>${titleOf(name)}</option>`)}</select></label>`;
   return html`<figure class="chart curve rows"><figcaption class="filter">${choose("Rows:", y, setY)}${choose("over", x, setX)}

@@ -1,5 +1,5 @@
 // One kept run: its note and name, its results, its rows and its picture, and what can be done with it.
-import { call, controllerText, html, sentence, useState } from "./common.js";
+import { call, Command, controllerText, html, sentence, useState } from "./common.js";
 import { selectionWithOwn, startJob } from "./experiments.js";
 import { Picture, Results, useResults } from "./results.js";
 import { Rows } from "./rows.js";
@@ -34,7 +34,7 @@ export function Run({ run, page, changed, open }) {
   };
   return html`
     ${about && html`<p>${about}</p>`}
-    ${run.command?.length > 0 && html`<p><code>${["fishctl", run.kind, ...run.command].join(" ")}</code></p>`}
+    ${run.command?.length > 0 && html`<${Command} words=${["fishctl", ...run.kind.split(" "), ...run.command]} />`}
     <p class="muted">${run.path}</p>
     <div class="edits">
       <${Edit} label="Note" value=${run.about?.note ?? ""} verb="Save" isOff=${!mayDrive} send=${(note) => ask("note", { note })} />

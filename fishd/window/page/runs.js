@@ -14,7 +14,9 @@ const shortDate = new Intl.DateTimeFormat([], { month: "short", day: "numeric", 
 
 const beginOf = (run) => run.began ?? run.about?.started ?? "";
 const numberOf = (run) => Number(run.number ?? run.about?.number ?? 0);
-const fishOf = (run) => run.about?.subject ?? "";
+const UNNAMED = "unnamed";
+/** Return the name of the fish, if it has one, and whether it was a simulated one. */
+const fishOf = ({ on, about }) => [about?.subject, [on, about?.source].includes("simulation") && "simulated"].filter(Boolean).join(", ") || UNNAMED;
 const timeOf = (run) => Date.parse(beginOf(run)) || 0;
 const compareTexts = (get) => (a, b) => get(a).localeCompare(get(b), undefined, { numeric: true });
 
@@ -37,8 +39,8 @@ const ORDERS = {
 
 /** Return whether a run has all words of a text in its name, its kind, or what is noted of it, or as its date. */
 function hasWords(run, text) {
-  const { subject, note, operator } = run.about ?? {};
-  const known = [run.name, whatOf(run), subject, note, operator, ...(run.command ?? [])].join(" ").toLowerCase();
+  const { note, operator } = run.about ?? {};
+  const known = [run.name, whatOf(run), fishOf(run), note, operator, ...(run.command ?? [])].join(" ").toLowerCase();
   return text.toLowerCase().split(/\s+/).every((word) => known.includes(word)
     || (word.length >= 4 && beginOf(run).startsWith(word)));
 }
@@ -49,6 +51,7 @@ export function Runs(page) {
   const [open, setOpen] = useState(null), [count, setCount] = useState(PAGE_RUNS);
   const [filter, setFilter] = useState({ text: "", controller: "", age: "any time", order: "newest first" });
   const [picked, setPicked] = useState([]), [compared, setCompared] = useState(null), [changes, setChanges] = useState(0);
+  const isShown = state.place === "runs" && Boolean(state.session?.paired);
   const finished = [...state.jobs.values()].filter(({ state: at }) => at !== "running").length;
   const load = () => call("GET", "/api/runs").then((found) => {
     setRuns(found);
@@ -56,8 +59,8 @@ export function Runs(page) {
     setFailure(null);
   }).catch(setFailure);
   useEffect(() => {
-    if (state.session?.paired) load();
-  }, [finished, changes, state.session?.paired]);
+    if (isShown) load();
+  }, [finished, changes, isShown, state.linked]);
   const known = state.controllers.map(({ name }) => name);
   const controllers = [...new Set((runs ?? []).flatMap((run) => controllersOf(run, known)))].sort();
   const set = (name) => (event) => {
@@ -71,7 +74,7 @@ export function Runs(page) {
     && timeOf(run) >= Date.now() - 86_400_000 * AGES[filter.age]).sort(ORDERS[filter.order]);
   const pick = (id) => () => setPicked((before) => (before.includes(id) ? before.filter((other) => other !== id) : [...before, id]));
   const changed = () => setChanges((n) => n + 1);
-  const hasFish = (runs ?? []).some(fishOf);
+  const hasFish = (runs ?? []).some((run) => fishOf(run) !== UNNAMED);
   return html`
     <div class="head-row"><h2 id="runs-title">Runs</h2><span class="muted" role="status">${runs
       && (shown.length === runs.length ? `${runs.length}` : `${shown.length} of ${runs.length}`)}</span>
@@ -80,12 +83,11 @@ export function Runs(page) {
       <label>Find <input type="search" placeholder="name, fish, note, date" value=${filter.text} onInput=${set("text")} /></label>
       <label>Controller <select value=${filter.controller} onChange=${set("controller")}><option value="">any</option>
         ${controllers.map((name) => html`<option value=${name}>${name}</option>`)}</select></label>
-      ${choose("Began", "age", AGES)}${choose("Sort by", "order", ORDERS)}
-      ${picked.length > 0 && html`<span class="buttons"><button type="button" class="primary" disabled=${picked.length < 2 || picked.length > MAX_COMPARED}
-        onClick=${() => setCompared(picked)}>Compare ${picked.length}</button>
-        <button type="button" onClick=${() => setPicked([])}>Pick none</button>
-        <span class="muted">${picked.length < 2 ? "Pick another one." : picked.length > MAX_COMPARED && `At most ${MAX_COMPARED}.`}</span></span>`}
-    </div>`}
+      ${choose("Began", "age", AGES)}${choose("Sort by", "order", ORDERS)}</div>`}
+    ${picked.length > 0 && html`<div class="buttons picked"><button type="button" class="primary" disabled=${picked.length < 2 || picked.length > MAX_COMPARED}
+      onClick=${() => setCompared(picked)}>Compare ${picked.length}</button>
+      <button type="button" onClick=${() => setPicked([])}>Pick none</button>
+      <span class="muted">${picked.length < 2 ? "Pick another one." : picked.length > MAX_COMPARED && `At most ${MAX_COMPARED}.`}</span></div>`}
     ${compared && html`<${Comparison} key=${compared.join()} runs=${compared} close=${() => setCompared(null)} />`}
     ${failure && html`<p class="note">The runs cannot be listed. ${sentence(failure.message)} ${sentence(failure.remedy)}</p>`}
     ${runs === null ? !failure && html`<p class="muted">Loading …</p>` : runs.length === 0

@@ -1,8 +1,6 @@
 """A start of fishd with another configuration, which systemd carries out."""
 
 import os
-import socket
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,23 +8,6 @@ from rigs.processes import PATIENCE, Daemon, running
 
 from fishd.client import Fish
 from fishd.core.errors import Refused
-
-
-@pytest.fixture
-def file(tmp_path: Path) -> Path:
-    path = tmp_path / "fishd.yaml"
-    path.write_text("name: pike\n")
-    return path
-
-
-@pytest.fixture
-def service(tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
-    path = str(tmp_path / "notify")
-    monkeypatch.setenv("NOTIFY_SOCKET", path)
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
-        systemd.bind(path)
-        with running(tmp_path, "--config", str(file)) as daemon:
-            yield daemon
 
 
 def refusal(fish: Fish) -> Refused:
@@ -51,7 +32,10 @@ def test_a_fish_at_rest_ends_with_the_status_at_which_systemd_starts_it_again(
     assert "stopping: fading to neutral" in errors
 
 
-def test_a_wrong_configuration_is_refused_and_the_fish_goes_on(service: Daemon, file: Path) -> None:
+def test_a_wrong_configuration_is_refused_and_the_fish_goes_on(
+    service: Daemon, tmp_path: Path
+) -> None:
+    file = tmp_path / "fishd.yaml"
     with Fish(service.endpoint, timeout=PATIENCE) as fish:
         file.write_text("name: pike\ntick: fast\n")
         refused = refusal(fish)

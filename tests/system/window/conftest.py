@@ -16,6 +16,14 @@ from rigs.window_process import (
 )
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _one_process() -> Iterator[None]:
+    """Let no experiment of a page start further processes, each of which loads the laboratory."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LOKY_MAX_CPU_COUNT", "1")
+        yield
+
+
 @pytest.fixture(scope="module")
 def shared_window(
     shared_daemon: Daemon, tmp_path_factory: pytest.TempPathFactory

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 from rigs.browser import needs_browser, open_page, shared_browser
-from rigs.live_page import RESOLVED, live_page, name_device, swim
+from rigs.live_page import PHONE, RESOLVED, live_page, name_device, swim
 from rigs.processes import Daemon, wait_until
 from rigs.window_process import WindowProcess, run_apart, running_window, wait_until_live
 
@@ -52,6 +52,11 @@ FIND_INK = """async () => {
     return [hasInk(left, top, box.width, 16), hasInk(left, top + 20, box.width, box.height - 24)];
   })];
 }"""
+IS_AT_REST = """() => {
+  const before = scrollY;
+  return new Promise((done) => setTimeout(() => done(scrollY === before), 200));
+}"""
+"""Returns whether the page no longer scrolls by the swing of a finger."""
 SPAN = "(() => { const { min, max } = charts.charts[0].plot.scales.x; return [min, max]; })()"
 
 
@@ -168,32 +173,48 @@ def test_a_pointer_pans_by_dragging_and_zooms_around_itself_with_ctrl_and_the_wh
     )
 
 
-def test_two_fingers_zoom_and_one_finger_pans(window: WindowProcess) -> None:
-    phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
-    with live_page(window.url, **phone) as (page, complaints):
+def test_fingers_zoom_pan_and_scroll_and_a_tap_saves_a_picture(window: WindowProcess) -> None:
+    with live_page(window.url, **PHONE) as (page, complaints):
         page.evaluate(FEED, [12_000, 0.05])
+        with page.expect_download() as download:
+            page.get_by_role("button", name="Picture").tap()
+        assert download.value.path().read_bytes().startswith(b"\x89PNG")
         box, session = area(page), page.context.new_cdp_session(page)
-        middle, y = box["x"] + 0.5 * box["width"], box["y"] + 40
+        middle, y = box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"]
 
-        def touch(kind: str, *offsets: float) -> None:
-            points = [{"x": middle + offset, "y": y, "id": n} for n, offset in enumerate(offsets)]
-            session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+        def touch(*paths: tuple[int, int, int, int]) -> None:
+            """Move fingers from one place to another, in steps [px, from the middle]."""
+            for step in range(11):
+                done, kind = step / 10, "touchMove" if step else "touchStart"
+                points = [
+                    {
+                        "x": middle + x + (to_x - x) * done,
+                        "y": y + up + (to_up - up) * done,
+                        "id": finger,
+                    }
+                    for finger, (x, up, to_x, to_up) in enumerate(paths)
+                ]
+                session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+            session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
 
-        page.click("#pause")
-        area(page)
-        low, high = span(page)
-        touch("touchStart", -20, 20)
-        for spread in range(24, 64, 4):
-            touch("touchMove", -spread, spread)
-        touch("touchEnd")
-        wait_until(lambda: span(page)[1] - span(page)[0] < 0.5 * (high - low))
-        near, far = span(page)
-        assert near + far == pytest.approx(low + high, abs=2.0)  # around the fingers
-        touch("touchStart", 0)
-        for moved in range(10, 100, 10):
-            touch("touchMove", moved)
-        touch("touchEnd")
-        wait_until(lambda: span(page)[1] < far - 0.5)
+        scrolled = page.evaluate("scrollY")
+        touch((0, 30, 20, -120))
+        wait_until(lambda: page.evaluate("scrollY") > scrolled + 50)
+        wait_until(lambda: page.evaluate(IS_AT_REST))
+        expect(page.locator("#pause")).to_have_text("Pause")  # the charts have not moved
+        page.tap("#pause")
+        y = area(page)["y"] + 0.5 * box["height"]
+        for fingers in (
+            ((-20, 0, -60, 0), (20, 0, 60, 0)),  # side by side
+            ((0, -12, 0, -36), (0, 12, 0, 36)),  # one above the other
+        ):
+            low, high = span(page)
+            touch(*fingers)
+            wait_until(lambda: span(page)[1] - span(page)[0] < 0.5 * (high - low))  # noqa: B023
+            near, far = span(page)
+            assert near + far == pytest.approx(low + high, abs=2.0)  # around the fingers
+        touch((0, 0, 100, 0))
+        wait_until(lambda: span(page)[1] < far - 0.2 * (far - near))
         assert span(page)[1] - span(page)[0] == pytest.approx(far - near)
         assert complaints == []
 

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import os
 import re
 import signal
 from collections.abc import Iterator
@@ -13,10 +14,10 @@ from playwright.sync_api import APIResponse, Page, Route, expect
 from rigs.browser import needs_browser, open_page, shared_browser
 from rigs.camera_process import running_camera
 from rigs.live_page import RESOLVED, go, live_page, name_device, swim
-from rigs.processes import Daemon, running, wait_until
+from rigs.processes import PATIENCE, Daemon, running, wait_until
 from rigs.recordings import record_run, swum
 from rigs.virtual_pi_process import Pi
-from rigs.window_process import WindowProcess
+from rigs.window_process import WindowProcess, running_window
 
 from fishd.lab.experiment import Header, open_experiment
 
@@ -395,6 +396,23 @@ def test_the_part_fish_shows_computer_settings_log_and_checks(window: WindowProc
         assert complaints == []
 
 
+def test_a_service_that_rests_is_restarted_from_the_page(service: Daemon, tmp_path: Path) -> None:
+    is_service = "from fishd.window import inspection; inspection._is_service = lambda link: True"
+    with (
+        running_window(tmp_path, changes=is_service, fish=service.endpoint) as window,
+        live_page(window.url) as (page, complaints),
+    ):
+        swim(page)
+        go(page, "fish")
+        restart = page.get_by_role("button", name="Restart fishd")
+        expect(restart).to_be_disabled()
+        service.at_rest()
+        restart.click()
+        assert service.process.wait(PATIENCE) == os.EX_TEMPFAIL
+        expect(page.locator("#connection")).to_contain_text("lost")
+        assert complaints == []
+
+
 def test_a_change_by_another_client_is_said_and_shown(
     window: WindowProcess, daemon: Daemon
 ) -> None:
@@ -465,6 +483,8 @@ def test_a_form_says_at_once_what_its_job_would_refuse(new_window: WindowProcess
         seconds.fill("20")
         expect(page.locator("#preview")).to_contain_text("20.25 to 3600 s are needed")
         expect(start).to_be_disabled()
+        seconds.fill("30 s")
+        expect(page.locator("#preview")).to_contain_text("seconds: '30 s' is not valid: a number")
         seconds.fill("21")
         expect(page.locator("#preview")).to_contain_text("fishctl measure swing --for 21")
         expect(start).to_be_enabled()
@@ -610,6 +630,14 @@ def test_runs_are_found_compared_noted_renamed_and_deleted_with_undo(
         page.get_by_role("button", name="Undo").click()
         expect(names).to_have_text(["run 1note 1", "thirdbetter"])
         expect(page.locator(".trash li")).to_have_count(0)
+
+        page.get_by_role("button", name="Open third").click()
+        page.get_by_role("button", name="Delete").click()
+        page.get_by_role("button", name="Empty trash").dblclick()  # does not remove anything
+        expect(page.locator(".trash li")).to_contain_text("third")
+        page.get_by_role("button", name="Empty trash").click()
+        page.get_by_role("button", name="Remove this run permanently").click()
+        expect(page.locator(".trash")).to_contain_text("It is empty")
         assert [line for line in complaints if "409" not in line] == []
 
 
@@ -624,7 +652,7 @@ def test_an_opened_run_a_comparison_and_the_trash_fit_each_screen_and_have_no_ba
         page.get_by_role("button", name="Compare 3").click()
         page.get_by_role("button", name="Open swept").click()
         page.get_by_role("button", name="Trash").click()
-        expect(page.locator(".rows canvas")).to_be_visible()
+        expect(page.locator(".rows canvas")).to_have_count(2)  # of the comparison and of the run
         expect(page.locator(".comparison tbody tr")).to_have_count(2)
         expect(page.locator(".comparison img")).to_be_visible()
         expect(page.locator(".note")).to_have_count(1)  # the sweep has no recording to draw
@@ -636,6 +664,26 @@ def test_an_opened_run_a_comparison_and_the_trash_fit_each_screen_and_have_no_ba
             assert table.evaluate("node => node.scrollWidth <= node.parentNode.clientWidth")
             refuse_barriers(page)
         walk(page)
+
+
+@pytest.mark.parametrize(
+    ("value", "half_width", "shown"),
+    [
+        (25.74123, 0.1234, ["25.74", "± 0.12"]),
+        (671.31489, 0.0008, ["671.31", "± 0.01"]),  # more digits than a value has
+        (0.0234, 0.79, ["0.02", "± 0.79"]),
+        (-0.123456, 0.0032, ["−0.1235", "± 0.0032"]),
+        (12345.6, 140.0, ["12346", "± 140"]),
+        (1.5, None, ["1.50", "± ?"]),
+    ],
+)
+def test_a_value_has_the_digits_of_its_interval_and_at_most_five(
+    window: WindowProcess, value: float, half_width: float | None, shown: list[str]
+) -> None:
+    with live_page(window.url) as (page, _):
+        show = "async (pair) => (await import('/common.js')).interval(pair[0], pair[1] ?? NaN)"
+        texts = page.evaluate(show, [value, half_width])
+        assert [text.replace("\N{NO-BREAK SPACE}", " ") for text in texts] == shown
 
 
 def test_lost_ticks_are_drawn_as_a_gap_and_suspect_samples_are_marked(
@@ -855,6 +903,14 @@ def test_a_queue_is_filled_ordered_started_and_stopped_without_a_mouse(
         expect(queue.get_by_role("progressbar")).to_be_visible()
         expect(page.locator("#mode")).to_have_text("running")
         refuse_flaws(page)
+        go(page, "live")
+        line = page.locator("#queue-line")
+        expect(line).to_contain_text("Queue: measure swing --for 45, then measure swing --for 50.")
+        line.get_by_role("button", name="Pause after it").press("Enter")
+        expect(line).to_contain_text("then it pauses")
+        refuse_flaws(page)
+        go(page, "experiments")
+        queue.get_by_role("button", name="Do not pause").press("Enter")
         queue.get_by_role("button", name="Stop now").press("Enter")
         expect(queue).to_contain_text("It pauses: it was to stop at ")
         expect(queue).to_contain_text("interrupted, is resumed")

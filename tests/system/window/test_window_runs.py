@@ -77,6 +77,33 @@ async def test_a_run_is_noted_renamed_deleted_and_brought_back(
         assert await browser.get("/api/trash") == []
 
 
+async def test_the_trash_is_emptied(window: WindowProcess, runs: Path) -> None:
+    async with Browser(window.url) as browser:
+        for name in ("first.mcap", "swept"):
+            await browser.post(f"/api/runs/{name}/delete")
+        assert await browser.post("/api/trash/empty") == []
+        assert await browser.get("/api/trash") == []
+        assert list(runs.rglob("*.mcap")) == []
+
+
+async def test_a_live_run_has_the_name_of_its_fish_though_fishd_knows_none(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    runs = tmp_path / "runs"
+    for number, endpoint in enumerate((daemon.endpoint, "ipc:///elsewhere")):
+        command = ["swing", "--endpoint", endpoint]
+        header = Header(kind="measure", on="live", command=command, number=number)
+        with open_experiment(runs / f"measured {number}", header):
+            pass
+    with running_window(tmp_path, tuna=daemon.endpoint) as window:
+        async with Browser(window.url) as browser:
+            listed = {run["name"]: run["about"] for run in await browser.get("/api/runs")}
+            assert listed == {"measured 0": {"subject": "tuna"}, "measured 1": {}}
+            body = {"fish": "tuna", "kind": "record", "options": {"seconds": 1}}
+            checked = await browser.post("/api/jobs/check", body)
+            assert " ".join(checked["command"]) == "fishctl record --subject tuna --for 1"
+
+
 async def test_a_run_in_progress_or_a_name_that_exists_is_a_line(
     window: WindowProcess, runs: Path
 ) -> None:
@@ -147,6 +174,7 @@ CHANGES = {
     "/api/runs/first.mcap/rename": {"name": "x"},
     "/api/runs/first.mcap/delete": {},
     "/api/trash/20260101-000000/restore": {},
+    "/api/trash/empty": {},
 }
 READS = (
     "/api/trash", "/api/results?run=first.mcap", "/api/results.png?run=first.mcap",

@@ -33,6 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert "the same command with --plane" in done.stdout
     (folder / "without-plane.json").write_bytes((folder / "lens.json").read_bytes())
     done = calibrate(folder, "lens.json", "lying.png", "--plane", "--square", SQUARE_MM, "--json")
+    assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["pixels_per_mm"] > 0.0
     film_video(folder / "fish.avi", FilmedTail(FILM), 0.0, 4.0)
     return folder

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from msgspec import structs
 from msgspec.structs import asdict
 from rigs.harness import Rig
 
@@ -348,8 +349,8 @@ def test_nothing_to_fit_is_refused(table: pd.DataFrame, spoil: object, complaint
 
 
 def test_the_law_of_the_servo_may_be_fixed(table: pd.DataFrame) -> None:
-    given = PlantParameters(servo_law="linear")
-    fit = ("omega0", "servo_lag")
+    given = structs.replace(FISH, servo_law="linear")
+    fit = ("omega0", "servo_lag", "rotation")
     assert identify(table, start=given, fit=fit, fix=("servo_law",)).servo_law == "linear"
     assert identify(table, start=given, fit=fit).servo_law != "linear"
 

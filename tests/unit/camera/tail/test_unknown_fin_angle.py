@@ -104,7 +104,7 @@ ROUGH, HIDDEN = "rough water", "rough water, body not in view"
 )
 def test_fewer_than_one_angle_in_a_hundred_is_wrong(water: str, fault: str) -> None:
     film = replace(faulty_films.FILMS[water], seed=7)
-    outcome = faulty_films.fail(learn(film), film, fault, 7, until=8.0)
+    outcome = faulty_films.fail(film, fault, 7, until=8.0)
     assert outcome.wrong < 0.01
     if fault in NAMED:
         assert outcome.told_s < 2.0

@@ -6,7 +6,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from fishd.virtual.plant.optimum import best_square_wave, fast_servo_thrust, square_wave
+from fishd.virtual.plant.optimum import (
+    best_square_wave,
+    fast_servo_thrust,
+    square_wave,
+    swims_forwards,
+)
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.tethered import TetheredFish
 
@@ -75,6 +80,22 @@ def test_no_frequency_beats_the_best_square_wave(xi: float, amplitude: float, sl
     best = best_square_wave(p, amplitude)
     for frequency in (1.99, *np.geomspace(0.1, 6.0, 15).tolist()):
         assert square_wave(p, amplitude, frequency).thrust <= best.thrust
+
+
+@pytest.mark.parametrize(
+    ("p", "swims"),
+    [
+        (DEFAULT, True),
+        (PlantParameters(servo_law="linear", xi=0.1), True),
+        (PlantParameters(backlash=0.9), False),
+        (PlantParameters(servo_law="linear", servo_dead_zone=0.5), False),
+    ],
+)
+def test_a_fish_swims_forwards_if_its_best_square_wave_thrusts(
+    p: PlantParameters, swims: bool
+) -> None:
+    assert swims_forwards(p, 0.42) is swims
+    assert (best_square_wave(p, 0.42).thrust > 0.0) is swims
 
 
 @pytest.mark.parametrize(

@@ -71,6 +71,8 @@ def integrate(
         if command is None:
             return 0.0
         lags = (command - phi) / p.servo_lag
+        if abs(lags) < 1e-10:  # else the solver swings about the end of a square root's motion
+            return 0.0
         return math.copysign(shares[p.servo_law](abs(lags)), lags) * p.servo_speed
 
     def acceleration(phi: float, alpha: float, rate: float) -> float:
