@@ -13,7 +13,7 @@ AHEAD := $(shell [ "$$(nice -n -20 nice 2>/dev/null)" = -20 ] && echo nice -n -2
 .PHONY: help run test test-realtime test-fast lint docs figures vendor bench clean
 
 help:  ## List what there is to make
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 15
+	@grep -E '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 15
 
 run: $(VENV)/installed  ## Swim a simulated fish until Ctrl-C
 	$(BIN)/fishd --config config/simulated.yaml --print-status

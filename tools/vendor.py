@@ -5,6 +5,7 @@ each file with its SHA-256, and writes the files. To change a version, edit it i
 empty `integrity` and `sha256`: they are then filled in.
 """
 
+import argparse
 import base64
 import hashlib
 import json
@@ -49,6 +50,7 @@ def check(what: str, entry: dict[str, Any], key: str, value: str) -> None:
 
 def main() -> None:
     """Fetch all packages, and store the manifest with their hashes."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     path = VENDOR / "manifest.json"
     manifest = json.loads(path.read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory() as folder:

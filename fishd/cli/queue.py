@@ -19,8 +19,12 @@ from fishd.core.experiment_queue import MAX_ITEMS, MAX_REPEAT, QueueFile, View
 from fishd.core.experiments import Plan
 from fishd.recording.folder import runs_folder
 
-EXPERIMENTS = ("measure", "sweep", "compare", "optimise", "identify", "adapt", "learn")
-"""Verbs that a queue takes."""
+EXPERIMENTS = (
+    "measure", "sweep", "compare", "optimise", "identify --experiment", "adapt", "learn ppo",
+)  # fmt: skip
+"""Verbs that a queue takes, with the words that make each an experiment."""
+MAX_CLOCK_S = 3e7
+"""Longest duration of a queue for which the time of its end is shown [s]."""
 _CHOSEN_OPTIONS = {
     "--folder", "--resume", "--endpoint", "--json", "--take", "--dry-run", "--help", "-h",
 }  # fmt: skip
@@ -67,9 +71,11 @@ def add(
     For example: fishctl queue add measure swing --for 60 --repeat 3. The words are checked now, as
     their verb does before the fish swims.
     """
-    if words[0] not in EXPERIMENTS:
-        known = ", ".join(EXPERIMENTS)
-        raise click.UsageError(f"'{words[0]}' is not an experiment; a queue takes: {known}")
+    taken = map(str.split, EXPERIMENTS)
+    if not any(words[0] == verb and {*needed} <= {*words} for verb, *needed in taken):
+        raise click.UsageError(
+            f"'{shlex.join(words)}' is not an experiment; a queue takes: {', '.join(EXPERIMENTS)}"
+        )
     for word in words:
         if word.partition("=")[0] in _CHOSEN_OPTIONS:
             raise click.UsageError(f"{word.partition('=')[0]} is chosen by the queue; leave it out")
@@ -107,10 +113,11 @@ def _check(fishctl: click.Command, words: Sequence[str], address: str) -> float 
 @_queue_options
 def list_items(file: QueueFile, as_json: bool) -> None:
     """Show what runs, what waits, how long it takes, and what has ended."""
-    _show(file, as_json)
+    show_queue(file, as_json)
 
 
-def _show(file: QueueFile, as_json: bool) -> None:
+def show_queue(file: QueueFile, as_json: bool) -> None:
+    """Print a queue; raise `QueueError`."""
     view = file.view()
     if as_json:
         print_json(view)
@@ -138,8 +145,9 @@ def _describe(view: View) -> str:
     start = view.reason or "start it with 'fishctl queue start'"
     parts = ["runs" if view.state == "running" else f"pauses: {start}"]
     at_least = "at least" if view.unknown else "about"
-    end = _format_time(time.time() + view.left)
-    parts.append(f"{at_least} {_format_duration(view.left)}, until {end} from now")
+    parts.append(f"{at_least} {_format_duration(view.left)}")
+    if view.left < MAX_CLOCK_S:
+        parts[-1] += f", until {_format_time(time.time() + view.left)} from now"
     if view.pauses:
         parts.append("it pauses after this run")
     if view.pause_at is not None:
@@ -167,7 +175,7 @@ def move(number: int, position: int, file: QueueFile, as_json: bool) -> None:
     """Move an experiment; position 1 is the first."""
     with file.changing() as content:
         content.move(number, position)
-    _show(file, as_json)
+    show_queue(file, as_json)
 
 
 @queue.command()
@@ -177,7 +185,7 @@ def remove(number: int, file: QueueFile, as_json: bool) -> None:
     """Remove an experiment that does not run. What it has measured is kept."""
     with file.changing() as content:
         content.remove(number)
-    _show(file, as_json)
+    show_queue(file, as_json)
 
 
 @queue.command()
@@ -186,7 +194,7 @@ def clear(file: QueueFile, as_json: bool) -> None:
     """Remove all experiments but the one that runs. All runs are kept."""
     with file.changing() as content:
         content.clear()
-    _show(file, as_json)
+    show_queue(file, as_json)
 
 
 def _read_time_of_day(_: click.Context, __: click.Parameter, value: str | None) -> float | None:
@@ -223,7 +231,7 @@ def pause(now: bool, at: float | None, cancel: bool, file: QueueFile, as_json: b
             content.cancel_pause()
         else:
             content.pause(time.time() if now else at)
-    _show(file, as_json)
+    show_queue(file, as_json)
 
 
 @queue.command()

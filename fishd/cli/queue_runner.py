@@ -88,8 +88,7 @@ class QueueRunner:
                 queue.pauses = False
                 return None
             item = queue.items[0]
-            kind = item.words[1] if item.words[0] == "learn" else item.words[0]
-            name = f"{kind}-{time.strftime('%Y%m%d-%H%M%S')}"
+            name = f"{_verb(item)[-1]}-{time.strftime('%Y%m%d-%H%M%S')}"
             item.run = item.run or files.unused_path(self._file.runs, name, "").name
             queue.current, queue.began = item.id, time.time()
         return item
@@ -119,8 +118,7 @@ class QueueRunner:
         """Run an item once; return the exit status of its process."""
         folder = self._file.runs.absolute() / item.run
         header = _read_header(folder)
-        verb = item.words[: 2 if item.words[0] == "learn" else 1]
-        place = [*verb, "--resume"] if header else [*item.words, "--folder"]
+        place = [*_verb(item), "--resume"] if header else [*item.words, "--folder"]
         take = ["--take"] if self._take else []
         words = ["--endpoint", self._file.address, *place, str(folder), *take]
         self._take, self._last_line = False, ""
@@ -197,6 +195,11 @@ class QueueRunner:
             if outcome == "failed":
                 queue.reason = f"experiment {item.id} failed: {message or f'status {status}'}"
         return outcome != "failed"
+
+
+def _verb(item: Item) -> list[str]:
+    """Return the verb of an item, such as `learn ppo`."""
+    return item.words[: 2 if item.words[0] == "learn" else 1]
 
 
 def _print_line(line: str) -> None:

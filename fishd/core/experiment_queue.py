@@ -36,6 +36,8 @@ RUNNER_TIMEOUT_S = 1.0
 """Longest wait for the lock of the runner, which a look at it holds for a moment [s]."""
 
 Repeat = Annotated[int, Meta(ge=1, le=MAX_REPEAT)]
+Time = Annotated[float, Meta(ge=0, le=2**33)]
+"""Unix time [s]; a later one than that of the year 2242 cannot be shown."""
 Outcome = Literal["done", "stopped", "failed"]
 
 
@@ -47,7 +49,7 @@ class Item(Struct, forbid_unknown_fields=True):
     """An experiment that waits or runs."""
 
     id: int
-    words: list[str]
+    words: Annotated[list[str], Meta(min_length=1)]
     """Verb and arguments."""
     cwd: str
     """Folder in which it was added, to which relative paths belong."""
@@ -55,7 +57,7 @@ class Item(Struct, forbid_unknown_fields=True):
     """Number of runs that are left, the present one included."""
     seconds: float | None = None
     """Expected duration of a run [s]; None if it is not known."""
-    run: str = ""
+    run: Annotated[str, Meta(pattern=r"^[\w-]*$")] = ""
     """Name of the folder of the run that has begun, or was interrupted and is resumed."""
 
 
@@ -64,8 +66,7 @@ class Past(Struct, forbid_unknown_fields=True):
 
     words: list[str]
     run: str
-    ended: float
-    """Unix time [s]."""
+    ended: Time
     outcome: Outcome
     message: str = ""
     """Result, or the reason of a failure."""
@@ -79,12 +80,12 @@ class Queue(Struct, forbid_unknown_fields=True):
     items: list[Item] = []
     current: int | None = None
     """Identifier of the item that runs, or ran when its runner was killed."""
-    began: float = 0.0
-    """Unix time at which that began [s]."""
+    began: Time = 0.0
+    """Time at which that began."""
     pauses: bool = False
     """Whether it pauses after the run that goes on."""
-    pause_at: float | None = None
-    """Unix time at which it interrupts what runs, and pauses [s]."""
+    pause_at: Time | None = None
+    """Time at which it interrupts what runs, and pauses."""
     reason: str = ""
     """Reason for which it has paused."""
     past: list[Past] = []

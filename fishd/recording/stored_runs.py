@@ -28,7 +28,7 @@ KEPT_DAYS = 30
 """Time for which a deleted run stays in the trash [days]."""
 PACKED_SUFFIXES = (SUFFIX, ".png", ".parquet", ".onnx", ".zip")
 """Endings of files that are compressed already."""
-_NAME = re.compile(r"(?!latest$|.*\.(part|json|txt|lock|runner)$)\w[\w. -]{0,99}")
+_NAME = re.compile(r"(?!latest$|.*\.(part|json|txt|lock|runner)$)\w[\w. -]{0,99}(?<! )")
 """Names of runs, which are neither another word for a run nor those of other files there."""
 _ID, _ID_FORMAT = re.compile(r"\d{8}-\d{6}(-\d+)?", re.A), "%Y%m%d-%H%M%S"
 _READ_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
@@ -79,7 +79,7 @@ def rename_run(path: Path, name: str) -> Path:
     if not _NAME.fullmatch(name):
         raise RecordingError(
             f"'{text.quoted(name)}' cannot be a name: letters, digits, '_', '-', '.' and spaces, "
-            "at most 100, the first one a letter, a digit or '_'; neither "
+            "at most 100, the first one a letter, a digit or '_', the last one no space; neither "
             f"'{LATEST}' nor a file's, such as queue.json"
         )
     _refuse_in_progress(path)

@@ -19,6 +19,7 @@ from deb.package import (
 SYSTEM = {path for path in (ROOT / "systemd").rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("earlier", "later"),
     [
@@ -57,6 +58,7 @@ def test_its_units_start_the_programs_of_the_package(tmp_path: Path) -> None:
         assert "install-pi" not in text
 
 
+@pytest.mark.slow
 def test_dash_can_read_the_scripts_of_the_package() -> None:
     for name in ("preinst", "postinst", "prerm", "postrm"):
         subprocess.run(["sh", "-n", HERE / name], check=True)

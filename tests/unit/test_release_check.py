@@ -9,6 +9,7 @@ import pytest
 import release_check
 
 
+@pytest.mark.slow
 def test_a_failed_check_stops_no_other_and_a_refused_one_says_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -149,7 +149,8 @@ class Learner:
             raise CannotLearn(_NO_SHAPE)
         scale = scene.factor
         steps = np.diff(times)
-        rates = np.abs(np.diff(alpha))[steps > 1e-3] / steps[steps > 1e-3]
+        is_step = steps > 0.1 * np.median(steps)  # not the same picture again
+        rates = np.abs(np.diff(alpha))[is_step] / steps[is_step]
         width, height = scene.size
         root = (np.array(scene.pose.root) + 0.5) * scale - 0.5
         half = np.median([trace.half for trace in seen], axis=0) * scale

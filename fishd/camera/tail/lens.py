@@ -14,6 +14,8 @@ from fishd.core.errors import FishdError
 from fishd.core.schema import note, unit
 
 Array = NDArray[np.float64]
+MAX_VALUE = 1e9
+"""Largest number of a lens: far beyond those of cameras, far below where computing fails."""
 _MAX_BYTES = 2**16
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-7)
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -53,8 +55,11 @@ class Lens(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     def __post_init__(self) -> None:
         """Raise ValueError for values that no camera has."""
-        if min(*self.size, *self.focal) <= 0.0:
-            raise ValueError("size and focal length must be positive")
+        if min(*self.size, *self.focal) < 1.0:
+            raise ValueError("size and focal length must be at least a pixel")
+        values = *self.size, *self.focal, *self.centre, *self.distortion, *self.plane
+        if max(map(abs, values)) > MAX_VALUE:
+            raise ValueError(f"the numbers of a lens are not beyond {MAX_VALUE:g}")
         if np.linalg.det(np.reshape(self.plane, (3, 3))) <= 0.0:
             raise ValueError("the map to the plane must not turn it over")
 

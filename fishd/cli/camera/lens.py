@@ -164,6 +164,10 @@ def _calibrate_from_files(
         lens.check(lens.size, turn)
     elif target.exists():
         raise FishdError(f"{target} exists already: give another file with --to")
+    try:
+        files.check_writable(target)
+    except files.FileProblem as problem:
+        raise FishdError(f"{target}: {problem}") from None
     watch = BoardWatch(turn or 0)
     with show_progress(len(paths), "files", err=True) as bar:
         for number, path in enumerate(paths):

@@ -105,17 +105,22 @@ def measure(
 def _learn(client: "CameraClient", fish: "Fish | None", seconds: float, as_json: bool) -> int:
     client.poll(1.0)
     client.check()  # before the fish moves
-    client.requests.learn_tail()
+    before, is_begun = client.status().tail_learned, False
     try:
         if fish is None or fish.status().mode == "running":
+            client.requests.learn_tail()
+            is_begun = True
             _watch_swim(client, seconds)
         else:
             with open_session(fish, REST_S + seconds) as rig:
+                client.requests.learn_tail()  # after the lease: another client may learn
+                is_begun = True
                 rig.rest(REST_S)
                 rig.swim("square", {"frequency": SWIM_HZ}, seconds)
     except (KeyboardInterrupt, FishdError) as error:
         with suppress(FishdError):  # a camera that is gone forgets, too
-            client.requests.cancel_tail()
+            if is_begun:
+                client.requests.cancel_tail()
         if isinstance(error, FishdError):
             raise
         echo("fishctl: interrupted: nothing is learned", err=True)
@@ -130,6 +135,8 @@ def _learn(client: "CameraClient", fish: "Fish | None", seconds: float, as_json:
             state = client.status()
     if state.tail_problem:
         raise FishdError(state.tail_problem)
+    if state.tail_learned == before:
+        raise FishdError("nothing is learned: another client has ended it; learn again")
     _print_learned(state, as_json)
     return 0
 

@@ -68,11 +68,13 @@ def measure_free(path: Path, options: VideoOptions, *, as_json: bool) -> int:
         unit = swim.unit
         names = ["video_time", f"x_{unit}", f"y_{unit}", "heading", f"speed_{unit}", f"tail_{unit}"]
         names += ["reason", *(name_midline(unit) if options.has_midline else ())]
-        table.finish(names, _to_rows(table, swim, options))
-    if options.picture:
-        from fishd.lab.fin_angle_figure import draw_swim
+        with resumable(table):
+            if options.picture:  # first: without the unfinished table, nothing could go on
+                from fishd.lab.fin_angle_figure import draw_swim
 
-        draw_swim(path.name, swim, example and (example[0].pixels, example[1]), options.picture)
+                seen = example and (example[0].pixels, example[1])
+                draw_swim(path.name, swim, seen, options.picture)
+            table.finish(names, _to_rows(table, swim, options))
     pictures, known = len(swim.times), int(np.count_nonzero(np.isfinite(swim.tail)))
     if as_json:
         values: dict[str, Any] = {"pictures": pictures, "known": known, "unknown": reasons}

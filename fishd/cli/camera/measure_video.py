@@ -244,12 +244,13 @@ def measure_video(path: Path, options: VideoOptions, *, learn: bool, as_json: bo
             columns += ("elapsed",)
             elapsed = clock.to_recording(times)
             rows = ([*row, f"{moment:.6f}"] for row, moment in zip(rows, elapsed, strict=True))
-        table.finish(columns, rows)
-    beats = find_maxima(times.tolist(), angles.tolist())
-    if options.picture:
-        from fishd.lab.fin_angle_figure import draw_fin_angle
+        beats = find_maxima(times.tolist(), angles.tolist())
+        with resumable(table):
+            if options.picture:  # first: without the unfinished table, nothing could go on
+                from fishd.lab.fin_angle_figure import draw_fin_angle
 
-        draw_fin_angle(path.name, times, angles, beats, examples, options.picture)
+                draw_fin_angle(path.name, times, angles, beats, examples, options.picture)
+            table.finish(columns, rows)
     mean = average(beats)
     periods = np.diff([beat.time for beat in beats])
     # Between neighbours no beat is unknown.

@@ -15,7 +15,6 @@ from fishd.core.errors import RecordingError
 from fishd.core.experiments import Estimate
 from fishd.core.files import os_errors
 from fishd.recording import stored_runs
-from fishd.recording.folder import check_new_files
 
 
 def _options(function: F) -> F:
@@ -109,8 +108,8 @@ def pack(run: str, target: Path | None, folder: Path) -> None:
         return
     if path.resolve() in target.resolve().parents:
         raise RecordingError(f"{target} would contain itself: write it outside of {path}")
-    check_new_files([target], replace=False)
-    with os_errors(RecordingError, f"{target} cannot be written"), ExitStack() as stack:
+    problem, remedy = f"{target} cannot be written", "give another file with --to"
+    with os_errors(RecordingError, problem, remedy), ExitStack() as stack:
         with target.open("xb") as file:
             stack.callback(target.unlink)
             stored_runs.pack_run(path, file)

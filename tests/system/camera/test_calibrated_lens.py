@@ -87,7 +87,7 @@ def test_a_calibration_that_no_camera_has_is_refused(folder: Path, tmp_path: Pat
     settings = ("source=stream", f"stream.url={folder}/lying.avi", f"tail.learned={tmp_path}/t.bin")
     with running_camera(tmp_path, *settings) as camera, camera.client() as client:
         for change, message in (
-            ({"focal": [0.0, 480.0]}, "size and focal length must be positive"),
+            ({"focal": [0.0, 480.0]}, "size and focal length must be at least a pixel"),
             ({"date": None}, "Expected `str`, got `null`"),
             (
                 {"rotate": 90},

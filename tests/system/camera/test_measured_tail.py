@@ -25,6 +25,7 @@ from rigs.processes import (
     wait_until,
 )
 
+from fishd.camera.client import CameraClient
 from fishd.client import Fish
 from fishd.config import load
 from fishd.core.errors import RecordingError
@@ -247,3 +248,28 @@ def test_a_camera_measures_on_when_learning_is_interrupted(
     assert "fishctl: interrupted: nothing is learned" in said
     after = camera.status()
     assert (after.tail, after.tail_learned) == ("measuring", before.tail_learned)
+
+
+def test_learning_that_another_client_ends_is_no_success(
+    daemon: Daemon, camera: CameraProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cancel(client: CameraClient, _: float) -> None:
+        client.requests.cancel_tail()
+
+    swim(daemon, "swing")
+    monkeypatch.setattr("fishd.cli.camera.measure._watch_swim", cancel)
+    done = measure(daemon, camera, "--learn")
+    assert "nothing is learned: another client has ended it; learn again" in one_line(done)
+
+
+def test_a_fish_that_is_taken_ends_no_learning_of_another_client(
+    daemon: Daemon, camera: CameraProcess
+) -> None:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish, camera.client() as client:
+        fish.stop()
+        client.requests.learn_tail()
+        with fish.lease("experiment"):
+            done = measure(daemon, camera, "--learn")
+        assert "the fish is taken" in one_line(done)
+        assert client.status().tail == "learning"
+        client.requests.cancel_tail()

@@ -108,6 +108,11 @@ def test_what_cannot_be_calibrated_is_named(
     assert not (folder / "nothing.json").exists()
 
 
+def test_a_file_that_cannot_be_written_is_refused_before_a_picture_is_read(folder: Path) -> None:
+    done = calibrate(folder, "nowhere/lens.json", "none.png")
+    assert "nowhere/lens.json: its folder does not exist; create it" in one_line(done)
+
+
 def test_a_calibration_is_not_overwritten_by_another(folder: Path) -> None:
     before = (folder / "lens.json").read_bytes()
     assert "lens.json exists already: give another file with --to" in one_line(

@@ -202,6 +202,12 @@ def test_a_video_with_the_head_at_the_right_is_turned(tmp_path: Path) -> None:
     assert json.loads(done.stdout)["fin_angle_max"] == pytest.approx(0.2, rel=0.01)
 
 
+def test_the_tail_is_learned_from_pictures_of_a_fast_camera(video: Path, tmp_path: Path) -> None:
+    done = measure(video, tmp_path / "fish.csv", "--rate", "5000")
+    assert done.returncode == 0
+    assert "the tail is learned from 0 s of the video on" in done.stderr
+
+
 Make = Callable[[Path], Path]
 
 
@@ -295,6 +301,17 @@ def test_rows_from_other_options_are_not_mixed(
         assert "the disk is full" in measure(video, tmp_path / "fish.csv", *learned).stderr
     done = measure(video, tmp_path / "fish.csv", "--rate", "20", *learned)
     assert "is from another video or other options: remove it" in one_line(done)
+
+
+def test_a_figure_that_cannot_be_written_costs_no_measurement(
+    video: Path, measured: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target, learned = tmp_path / "fish.csv", ("--learned", measured[2] / "fish.bin")
+    done = measure(video, target, "--plot", "/proc/fish.png", *learned)
+    assert "/proc/fish.png: the figure cannot be written" in one_line(done)
+    monkeypatch.setattr(VideoTable, "add", None)
+    assert measure(video, target, *learned).returncode == 0
+    assert pandas.read_csv(target).fin_angle.equals(measured[0].fin_angle)
 
 
 def test_a_recording_of_another_swim_costs_no_measurement(

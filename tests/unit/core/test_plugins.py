@@ -69,6 +69,7 @@ def test_what_cannot_be_had_is_explained(gadgets: Plugins[Gadget], name: str, me
         gadgets.find(name)
 
 
+@pytest.mark.slow
 def test_packages_are_found_beside_the_built_in_plugins(
     gadgets: Plugins[Gadget], install: Callable[[str, str], None]
 ) -> None:
@@ -92,6 +93,7 @@ def test_a_package_in_an_archive_is_found(
     assert gadgets.find("packed") is Gadget
 
 
+@pytest.mark.slow
 def test_one_that_was_repaired_loads_and_its_problem_is_forgotten(
     gadgets: Plugins[Gadget], install: Callable[[str, str], None], tmp_path: Path
 ) -> None:

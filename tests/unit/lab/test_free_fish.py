@@ -11,6 +11,8 @@ from rigs.filmed_video import FilmedFish, write_video
 from rigs.interrupted_table import interrupt_after
 from rigs.processes import fishctl, one_line
 
+from fishd.camera.video_table import VideoTable
+
 pytestmark = pytest.mark.slow
 SECONDS, RATE, MM = 4.0, 25.0, 120.0
 
@@ -157,6 +159,19 @@ def test_an_interrupted_search_goes_on_where_it_ended_with_the_same_ground(
     monkeypatch.setattr("fishd.lab.free_fish.learn_ground", None)
     assert fishctl(*words, str(target)).returncode == 0
     assert target.read_text() == whole.read_text()
+
+
+def test_a_figure_that_cannot_be_written_costs_no_measurement(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "fish.csv"
+    video = film(tmp_path, FilmedFish(), 2.0)
+    words = ("camera", "measure", str(video), "--free", "--to", str(target))
+    done = fishctl(*words, "--plot", "/proc/fish.png")
+    assert "/proc/fish.png: the figure cannot be written" in one_line(done)
+    monkeypatch.setattr(VideoTable, "add", None)
+    assert fishctl(*words).returncode == 0
+    assert len(pandas.read_csv(target)) == 50
 
 
 def test_a_head_that_a_kill_has_torn_is_written_again(tmp_path: Path) -> None:

@@ -148,6 +148,7 @@ NAMES = [
     "x.part",
     "a\x1b",
     "latest",
+    "x ",
     "queue.json",
     "noted",
 ]
@@ -278,7 +279,7 @@ def test_a_zip_file_has_all_files_of_a_run_and_nothing_else(
     make(swept / "more")
     (swept / "outside").symlink_to(folder.parent)
     assert runs(folder, "zip", "swept") == "swept.zip\n"
-    assert "swept.zip already exists" in refuse(folder, "zip", "swept")
+    assert "File exists; give another file with --to" in refuse(folder, "zip", "swept")
     with zipfile.ZipFile("swept.zip") as archive:
         names = {"experiment.json", "rows.csv", "ticks/1.mcap"}
         assert set(archive.namelist()) == {f"swept/{name}" for name in names}

@@ -114,8 +114,10 @@ class Pigpiod:
 
     def start(self) -> None:
         """Listen; raises OSError when the port is taken."""
-        self._listener = self._bind_listener()
-        self._address = self._listener.getsockname()[:2]
+        with self._bind_socket() as chosen:
+            self._address = chosen.getsockname()[:2]
+            # Unlike a port that the kernel chose, one that was asked for outlasts a `shutdown`.
+            self._listener = self._bind_socket()
         self._epoll = select.epoll()
         self._waker = os.eventfd(0)
         self._epoll.register(self._waker, select.EPOLLIN)
@@ -261,11 +263,11 @@ class Pigpiod:
         for connection in list(self._connections.values()):
             self._drop(connection)
         self._commands.restart(now)
-        self._listener.close()
-        # Bound but not listening: connections are refused, and the port stays reserved.
-        self._listener = self._bind_listener()
+        # Bound but not listening: connections are refused, and no other process gets the port.
+        self._epoll.unregister(self._listener)
+        self._listener.shutdown(socket.SHUT_RD)
 
-    def _bind_listener(self) -> socket.socket:
+    def _bind_socket(self) -> socket.socket:
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

@@ -265,11 +265,12 @@ def test_the_printed_board_has_its_true_size() -> None:
         lambda content: b"\xff\xfe" + content,
         lambda content: b"{}",
         lambda content: re.sub(rb'"focal": \[\s*[\d.]+', b'"focal": [0.0', content),
+        lambda content: re.sub(rb'"focal": \[\s*[\d.]+', b'"focal": [1e300', content),
         lambda content: re.sub(
             rb'"plane": \[[^]]*\]', b'"plane": ' + b"[" + 8 * b"0," + b"0]", content
         ),
     ],
-    ids=["torn", "no text", "another", "no focal length", "no plane"],
+    ids=["torn", "no text", "another", "no focal length", "no number of a camera", "no plane"],
 )
 def test_a_file_that_is_no_calibration_is_refused(
     lens: Lens, tmp_path: Path, change: Callable[[bytes], bytes]

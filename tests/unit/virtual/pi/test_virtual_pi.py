@@ -94,3 +94,18 @@ def test_the_real_driver_finds_out_which_adc_it_has(adc: str) -> None:
         robot, _ = open_in_virtual_time(config, stack)
         robot.sensor.read(config.tick)
         assert any("ADS1015" in line for line in robot.limitations()) == (adc == "ads1015")
+
+
+def test_a_pigpiod_that_starts_again_never_gives_up_its_port(
+    pi: VirtualPi, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def take(*_: object) -> None:
+        raise AssertionError("another process could have taken the port before")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("socket.socket.bind", take)
+        pi.faults.inject("pigpiod-restart")
+        steer(pi)
+        pi.faults.inject("pigpiod-gone")
+        with pytest.raises(OSError, match="refused"):
+            steer(pi)
