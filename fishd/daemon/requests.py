@@ -46,12 +46,12 @@ class Access(NamedTuple):
 
 
 class Restart(NamedTuple):
-    """Functions for a restart by systemd."""
+    """How fishd is started again by systemd."""
 
     read_config: Callable[[], Config]
-    """Function that reads the configuration of the next start; it raises `ConfigError`."""
+    """Function that reads the configuration that it will have; it raises `ConfigError`."""
     end: Callable[[], None]
-    """Function that ends fishd, with the status at which systemd starts it again."""
+    """Function that lets it end for that."""
 
 
 class Operations:
@@ -74,7 +74,7 @@ class Operations:
         controllers: controllers that can be made active
         realtime: whether the loop runs under SCHED_FIFO
         access: function that returns how clients reach this fishd
-        restart: functions for a restart by systemd; None where it has not started fishd
+        restart: how systemd starts it again; None if it does not
         """
         self._loop = loop
         self._clock = clock
@@ -330,7 +330,7 @@ class Operations:
         if systemd is None:
             raise Refused(
                 "no-service",
-                "systemd has not started fishd, and would not start it again: end and start it by "
+                "fishd is no service of systemd, which would start it again: end and start it by "
                 "hand",
             )
         self._check_may_end()
