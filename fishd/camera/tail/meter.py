@@ -139,7 +139,7 @@ class TailMeter:
         self._turns: deque[tuple[float, float, bool]] = deque()
         """Time, turn, and whether the fin is on the positive side."""
         self._errors: deque[tuple[float, float]] = deque()
-        """Time and square of the distance from the learned shape [px²]."""
+        """Time and distance from the learned shape [px]."""
         usual = _SCENE_USUAL * np.array(learned.pose_error)
         shift = _MAX_SHIFT * width
         self._max_pose = np.maximum([shift, shift, _MAX_SCENE_TURN_RAD], usual)
@@ -349,10 +349,10 @@ class TailMeter:
     def _is_distant(self, error: float, time: float) -> bool:
         """Return whether a midline is far from the learned shape, or were those just before it."""
         errors = self._errors
-        errors.append((time, error**2))
+        errors.append((time, min(error, self._max_error)))  # not spoilt by a bubble
         while not 0.0 <= time - errors[0][0] <= _DOUBT_S:
             errors.popleft()
-        recent = math.sqrt(np.mean([square for _, square in errors]))
+        recent = float(np.mean([each for _, each in errors]))
         is_doubtful = len(errors) >= _MIN_DOUBT_READINGS and recent > self._max_recent_error
         return error > self._max_error or is_doubtful
 
