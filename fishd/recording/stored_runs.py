@@ -169,21 +169,23 @@ def empty_trash(folder: Path, days: float = 0.0, ids: Collection[str] = ()) -> i
 def pack_run(path: Path, stream: IO[bytes]) -> None:
     """Write the files of a run as a zip file into a stream, with little memory; raise OSError.
 
-    Links, pipes and locks are left out.
+    Links, pipes and locks are left out. Raise `RecordingError` if the run is removed meanwhile.
     """
-    name = _name_of(path)
-    with zipfile.ZipFile(stream, "w", strict_timestamps=False) as archive:
-        if not path.is_dir():
-            folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-            try:
+    name, is_folder = _name_of(path), path.is_dir()
+    place = os.open(path if is_folder else path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with zipfile.ZipFile(stream, "w", strict_timestamps=False) as archive:
+            if not is_folder:
                 for file in (path.name, note_path(path).name):
-                    _pack_file(archive, file, folder, name)
-            finally:
-                os.close(folder)
-            return
-        for root, _, names, folder in os.fwalk(path):
-            for file in sorted(names):
-                _pack_file(archive, file, folder, str(name / Path(root).relative_to(path)))
+                    _pack_file(archive, file, place, name)
+                return
+            for root, _, names, folder in os.fwalk(".", dir_fd=place):
+                for file in sorted(names):
+                    _pack_file(archive, file, folder, str(Path(name, root)))
+            if not os.access(EXPERIMENT, os.F_OK, dir_fd=place):
+                raise RecordingError(f"{name} was removed before all of it was packed")
+    finally:
+        os.close(place)
 
 
 def _pack_file(archive: zipfile.ZipFile, name: str, folder: int, place: str) -> None:

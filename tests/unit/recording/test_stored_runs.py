@@ -9,11 +9,13 @@ import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rigs.processes import fishctl, one_line
 from rigs.recordings import record_run, swum
 
+from fishd.core.errors import RecordingError
 from fishd.core.process.lockfile import locked
 from fishd.lab.experiment import Header, open_experiment
 from fishd.recording import RunWriter, open_run, stored_runs
@@ -282,6 +284,18 @@ def test_a_trash_that_is_a_link_takes_nothing(
     (outside / "20000101-000000").mkdir()
     assert empty_trash(folder) == 0
     assert (outside / "20000101-000000").is_dir()
+
+
+def test_a_run_that_is_removed_while_it_is_packed_is_no_zip_file(folder: Path) -> None:
+    class Stream(io.BytesIO):
+        def write(self, data: Any) -> int:
+            if (folder / "swept").exists():
+                delete_run(folder / "swept")
+                empty_trash(folder)
+            return super().write(data)
+
+    with pytest.raises(RecordingError, match="swept was removed before all of it was packed"):
+        stored_runs.pack_run(folder / "swept", Stream())
 
 
 def make_fifo(path: Path) -> None:
