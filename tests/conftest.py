@@ -136,7 +136,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _deal(items: list[pytest.Item], count: int) -> list[list[pytest.Item]]:
-    """Return equal parts, each of modules from all folders; long modules are at the begin."""
+    """Return equal parts, each of modules from all folders; long modules begin first."""
     modules = sorted({item.path for item in items})
     long = [path for path in modules if path.stem in LONG_MODULES]
     place = {path: number % count for number, path in enumerate(modules)}

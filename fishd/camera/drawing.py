@@ -42,30 +42,27 @@ def enlarge(colours: Colours) -> Colours:
     return np.asarray(colours.repeat(factor, axis=0).repeat(factor, axis=1))
 
 
-def draw_axis(colours: Colours, axis: Axis | None, size: int, crop: Crop | None = None) -> Colours:
-    """Return the picture with an axis drawn in.
+def draw_axis(colours: Colours, axis: Axis, size: int) -> Colours:
+    """Return an enlarged frame of `size` rows and columns with its axis drawn in."""
+    scale = len(colours) / size
+    left, right = (round((column + 0.5) * scale - 0.5) for column in (0, size - 1))
+    rows = axis.rows(size, size)
+    first, last = (round((float(row) + 0.5) * scale - 0.5) for row in (rows[0], rows[-1]))
+    thickness = max(1, len(colours) // 240)
+    style = cv2.LINE_AA if thickness > 1 else cv2.LINE_8
+    drawn = cv2.line(colours.copy(), (left, first), (right, last), AXIS_COLOUR, thickness, style)
+    return np.asarray(drawn, np.uint8)
 
-    axis: axis in frames of `size` rows and columns; None draws nothing
-    crop: part of the picture that frames show; None where the picture shows the same part
-    """
-    drawn = np.ascontiguousarray(colours)
-    height, width = drawn.shape[:2]
-    crop = crop or Crop(left=0.0, top=0.0, width=1.0, height=1.0)
 
-    def point(column: float, row: float) -> tuple[int, int]:
-        x = (crop.left + (column + 0.5) / size * crop.width) * width - 0.5
-        y = (crop.top + (row + 0.5) / size * crop.height) * height - 0.5
-        return round(x), round(y)
-
-    if (crop.width, crop.height) != (1.0, 1.0):
-        corner, opposite_corner = point(-0.5, -0.5), point(size - 0.5, size - 0.5)
-        cv2.rectangle(drawn, corner, opposite_corner, CROP_COLOUR, 1)
-    if axis is not None:
-        rows = axis.rows(size, size)
-        ends = point(0.0, float(rows[0])), point(size - 1.0, float(rows[-1]))
-        thickness = max(1, min(height, width) // 240)
-        cv2.line(drawn, *ends, AXIS_COLOUR, thickness, cv2.LINE_AA if thickness > 1 else cv2.LINE_8)
-    return drawn
+def draw_crop(colours: Colours, crop: Crop) -> Colours:
+    """Return the camera's whole picture with the outline of the part that frames show."""
+    if (crop.width, crop.height) == (1.0, 1.0):
+        return colours
+    height, width = colours.shape[:2]
+    left, right = (round(x * width - 0.5) for x in (crop.left, crop.left + crop.width))
+    top, bottom = (round(y * height - 0.5) for y in (crop.top, crop.top + crop.height))
+    outlined = cv2.rectangle(colours.copy(), (left, top), (right, bottom), CROP_COLOUR, 1)
+    return np.asarray(outlined, np.uint8)
 
 
 def decode_view(view: PublishedView) -> Colours:

@@ -107,7 +107,7 @@ def clear_fault(endpoint: str | None, as_json: bool) -> None:
 @click.command()
 @daemon_options
 def restart(endpoint: str | None, as_json: bool) -> None:
-    """Have systemd start the daemon again, which reads its configuration anew.
+    """Let systemd restart the daemon, which then reads its configuration again.
 
     Refused while the fish swims or an experiment has it, and if the configuration is wrong.
     """

@@ -25,7 +25,7 @@ VERBS = {
         "stop": Verb("control", "stop", "Fade to neutral and stay there."),
         "estop": Verb("estop", "estop", "Emergency stop: no more pulses, at once."),
         "clear-fault": Verb("control", "clear_fault", "Leave mode fault or estop."),
-        "restart": Verb("control", "restart", "Start the service again, with its configuration."),
+        "restart": Verb("control", "restart", "Restart fishd, to read its configuration again."),
         "release": Verb(
             "release", "release", "Last resort without the daemon: neutral, then no pulses."
         ),

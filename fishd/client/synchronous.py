@@ -162,7 +162,7 @@ class Fish(Connection):
         return self._call(State, "clear-fault")
 
     def restart(self) -> State:
-        """Have systemd start fishd again, which reads its configuration anew; raise `Refused`."""
+        """Let systemd restart fishd, which then reads its configuration again; raise `Refused`."""
         return self._call(State, "restart", patience=LOADING_TIMEOUT_S)
 
     def mark(self, text: str) -> State:

@@ -65,9 +65,7 @@ class Daemon:
         file: Path | None = None,
         overrides: Sequence[str] = (),
     ) -> None:
-        """
-        file, overrides: what the configuration was read from
-        """
+        """file, overrides: what the configuration was read from"""
         self._config = config
         self._file = file
         self._overrides = overrides

@@ -59,7 +59,7 @@ class FilmedBoard:
         blur: standard deviation [px]
         """
         film, width = self.film, float(self.film.width)
-        # Where a square's sides and the board's corner lie before the camera, in widths.
+        # Sides of a square and corner of the board, in the axes of the camera, in widths.
         sides = square * rotation[:, :2]
         corner = np.asarray(place) + np.array([0.0, 0.0, 1.0]) - sides @ (COLUMNS / 2, ROWS / 2)
         to_picture = np.diag([width, width, 1.0]) @ np.column_stack([sides, corner])

@@ -37,7 +37,7 @@ class Turn(NamedTuple):
     """Results beside one camera, or none, in one round."""
 
     lateness: list[float]
-    """Of each tick [µs]."""
+    """Lateness of each tick [µs]."""
     measured: float = 0.0
     """Measured pictures per second."""
     memory: float = 0.0

@@ -38,14 +38,15 @@ _FOREIGN_LEVEL = 0.5
 _MIN_FIN_SEEN = 0.6
 """Smallest fraction of the fin's stations that must be seen."""
 _MAX_SHAPE_ERROR = 0.004
-"""Permitted distance of a midline from the learned shape, relative to the picture's width; of
-those just before it, half of it on average."""
+"""Permitted distance of a midline from the learned shape, relative to the picture's width. The
+permitted root mean square of the latest ones is half of it."""
 _USUAL_ERROR, _USUAL_RECENT_ERROR = 1.5, 1.0
-"""The same, relative to that of 95 % of the learned pictures, if that is larger."""
+"""Permitted distance, and permitted root mean square of the latest ones, relative to the distance
+that 95 % of the learned pictures stay below; they count if they are larger."""
 _MIN_DIFFERENCE_RAD, _MAX_DIFFERENCE_RAD = 0.03, 0.045
 """Range of the permitted difference of the fin's direction from that by the learned shape [rad]."""
 _USUAL_DIFFERENCE = 3.0
-"""The same, relative to that of 95 % of the learned pictures."""
+"""Permitted difference, relative to the one that 95 % of the learned pictures stay below."""
 _MAX_TURN_RAD = 0.03
 """Permitted turn of a midline about its root in one picture [rad]."""
 _WAVE_GAIN, _SHAPE_GAIN = 1.8, 2.0
@@ -56,14 +57,15 @@ _MIN_WAVE_RAD = 0.006
 _SEEN_TURN = 2.5
 """Factor of the permitted turns of a midline beside edges that show a turn of the camera."""
 _USUAL_TURN, _USUAL_RECENT_TURN = 1.6, 1.0
-"""Permitted turn of a midline, and of those just before it, on average; relative to that of 95 % of
-the learned pictures, if that is larger."""
+"""Permitted turn of a midline, and permitted mean of the latest ones, relative to the turn that
+95 % of the learned pictures stay below; they count if they are larger."""
 _KNOCK_S, _DOUBT_S = 0.8, 0.1
 """Times over which the turn of the midlines is averaged, for the zero and for one picture [s]."""
 _KNOCK_RAD = 0.012
 """Mean turn above which the zero has moved [rad]."""
 _MEAN_TURN = 0.5
-"""The same, relative to the turn that 95 % of single learned pictures stay below."""
+"""Mean turn above which the zero has moved, relative to the turn that 95 % of the learned pictures
+stay below."""
 _MOVED_S = 0.3
 """Time for which the angle stays unknown after pictures that show a move of the camera, as waves
 hide it from others [s]."""
@@ -334,9 +336,8 @@ class TailMeter:
     def _is_whole(self, seen: _Seen) -> bool:
         """Return whether the whole tail has the learned shape, perhaps turned."""
         low, high = self.learned.span
-        limit = max(0.5 * _MAX_SHAPE_ERROR * self.learned.size[0], self.learned.shape_error)
         is_seen = seen.trace.weight.mean() > 0.9 and low <= seen.alpha <= high
-        return bool(is_seen and seen.fit.error_turned < limit)
+        return bool(is_seen and seen.fit.error_turned < self._max_recent_error)
 
     def _recent_turns(self, span: float) -> list[tuple[float, bool]]:
         """Return the turns of the latest time [s], and their sides; none if it has gaps."""

@@ -36,7 +36,7 @@ SWIM_REMEDY = "let it swim, with 'fishctl set-controller swing', or add --swim"
 @camera_option
 @endpoint_option
 @take_option
-@png_option
+@png_option()
 @for_option("Duration of the search [s].", default=10.0, kind=FiniteRange(min=2.0, max=600.0))
 @click.option("--swim", is_flag=True, help="Let the fish swim meanwhile; it rests afterwards.")
 @json_option

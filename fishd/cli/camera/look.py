@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fishd.cli.camera.options import camera_option, check_png
+from fishd.cli.camera.options import camera_option, check_png, png_option
 from fishd.cli.options import json_option
 from fishd.cli.output import echo, echo_rows, format_count, make_printable, print_json
 from fishd.core.errors import FishdError
@@ -84,14 +84,7 @@ def _describe_tail(state: "CameraState") -> str:
 
 @click.command()
 @camera_option
-@click.option(
-    "--plot",
-    "png",
-    required=True,
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="File of the picture, whose name ends in .png.",
-)
+@png_option(required=True)
 @click.option(
     "--whole", is_flag=True, help="Write the whole picture of the camera, not only the crop."
 )
@@ -115,8 +108,8 @@ def view(address: str | None, png: Path, whole: bool, as_json: bool) -> None:
         if whole and client.view is None:
             raise FishdError("the camera sends no views: publish.view_rate of its settings is 0")
         if client.view and whole:
-            colours, crop = drawing.decode_view(client.view), client.view.header.crop
-            drawing.write_png(png, drawing.draw_axis(colours, None, len(pixels), crop))
+            colours = drawing.decode_view(client.view)
+            drawing.write_png(png, drawing.draw_crop(colours, client.view.header.crop))
         else:
             drawing.write_png(png, drawing.enlarge(drawing.to_colours(pixels)))
     age = header.available - header.time

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import yaml
 
-from fishd.cli.options import verb_lease
+from fishd.cli.options import F, verb_lease
 from fishd.cli.output import echo
 from fishd.client import Fish
 from fishd.core import files
@@ -31,13 +31,18 @@ camera_option = click.option(
     metavar="ADDRESS",
     help="Request address of the camera; default: $FISHD_CAMERA, else the one of this machine.",
 )
-png_option = click.option(
-    "--plot",
-    "png",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="Write the picture into this file.",
-)
+
+
+def png_option(*, required: bool = False) -> Callable[[F], F]:
+    """Return the option for the file of a picture."""
+    return click.option(
+        "--plot",
+        "png",
+        required=required,
+        type=click.Path(path_type=Path, dir_okay=False),
+        metavar="FILE",
+        help="PNG file for the picture.",
+    )
 
 
 def check_png(path: Path | None) -> None:

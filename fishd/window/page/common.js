@@ -89,6 +89,23 @@ const quote = (word) => (/^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replace
 export const Command = ({ words, label = "Command line" }) => html`<code tabindex="0" aria-label=${label}>${
   words.map((word) => html`<span>${quote(word)}</span> `)}</code>`;
 
+/** Return a colour of the page by its name. */
+export const colourOf = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
+
+/** Draw a chart into a node, and keep it as wide as that; return it, and the function that removes it. */
+export function drawPlot(node, { axes, ...options }, data) {
+  const axis = { stroke: () => colourOf("muted"), font: "11px system-ui, sans-serif", ticks: { show: false }, grid: { stroke: () => colourOf("grid"), width: 1 } };
+  const plot = new globalThis.uPlot({
+    width: node.clientWidth, legend: { show: false }, cursor: { drag: { x: false, y: false } }, ...options, axes: axes.map((own) => ({ ...axis, ...own })),
+  }, data, node);
+  const watch = new ResizeObserver(([{ contentRect: { width } }]) => width > 0 && plot.setSize({ width, height: options.height }));
+  watch.observe(node);
+  return [plot, () => {
+    watch.disconnect();
+    plot.destroy();
+  }];
+}
+
 /** An answer of the server that is not the result. */
 export class Refusal extends Error {
   constructor({ code, message, remedy }, status) {

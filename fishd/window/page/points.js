@@ -1,8 +1,8 @@
 // The curve of an experiment that grows with each result: points with their intervals.
-import { html, useEffect, useLayoutEffect, useRef } from "./common.js";
+import { colourOf, drawPlot, html, useEffect, useLayoutEffect, useRef } from "./common.js";
 
 const HEIGHT = 150, MAX_SERIES = 4;
-const COLOURS = ["--fx", "--virtual", "--fy", "--phi"];
+const COLOURS = ["fx", "virtual", "fy", "phi"];
 
 /** Return columns of uPlot, and the half-widths of each series: x, then one column for each series; null where it has no point. */
 function columnsOf(points, factor) {
@@ -57,29 +57,21 @@ export function Points({ points, factor, unit }) {
   const { x_name: xName, y_name: yName = "thrust" } = points[0];
   const columns = columnsOf(points, factor), names = columns.names.join("|");
   useLayoutEffect(() => {
-    const style = getComputedStyle(document.documentElement), colour = (name) => () => style.getPropertyValue(name);
-    const axis = { stroke: colour("--muted"), font: "11px system-ui, sans-serif", ticks: { show: false }, grid: { stroke: colour("--grid"), width: 1 } };
     const state = { halves: columns.halves };
-    state.plot = new globalThis.uPlot({
-      width: node.current.clientWidth, height: HEIGHT, padding: [6, 12, 0, 0], legend: { show: false }, cursor: { drag: { x: false, y: false } },
-      scales: { x: { time: false }, y: { range: (plot) => limitsOf(state.halves, plot) } },
-      axes: [{ ...axis, size: 24 }, { ...axis, size: 44 }], hooks: { draw: [(plot) => drawIntervals(plot, state.halves)] },
-      series: [{}, ...columns.names.map((_, index) => ({ stroke: colour(COLOURS[index]), width: 1, spanGaps: true, points: { show: true, size: 6 } }))],
-    }, columns.data, node.current);
-    shown.current = state;
-    const watch = new ResizeObserver(([{ contentRect }]) => contentRect.width > 0 && state.plot.setSize({ width: contentRect.width, height: HEIGHT }));
-    watch.observe(node.current);
-    return () => {
-      watch.disconnect();
-      state.plot.destroy();
-    };
+    const [plot, remove] = drawPlot(node.current, {
+      height: HEIGHT, padding: [6, 12, 0, 0], scales: { x: { time: false }, y: { range: (own) => limitsOf(state.halves, own) } },
+      axes: [{ size: 24 }, { size: 44 }], hooks: { draw: [(own) => drawIntervals(own, state.halves)] },
+      series: [{}, ...columns.names.map((_, index) => ({ stroke: () => colourOf(COLOURS[index]), width: 1, spanGaps: true, points: { show: true, size: 6 } }))],
+    }, columns.data);
+    shown.current = Object.assign(state, { plot });
+    return remove;
   }, [names]);
   useEffect(() => {
     shown.current.halves = columns.halves;
     shown.current.plot.setData(columns.data);
   }, [points.length, factor]);
   return html`<figure class="chart curve"><figcaption><span>${yName} [${unit}]</span>
-    ${columns.names.length > 1 ? html`<span class="keys">${columns.names.map((name, index) => html`<span style=${`--key: var(${COLOURS[index]})`}>${name}</span>`)}</span>`
+    ${columns.names.length > 1 ? html`<span class="keys">${columns.names.map((name, index) => html`<span style=${`--key: var(--${COLOURS[index]})`}>${name}</span>`)}</span>`
       : html`<span class="muted">over ${xName}</span>`}</figcaption>
     <div class="plot" role="img" aria-label=${`Chart of ${yName} over ${xName}, ${points.length} points`} ref=${node}></div></figure>`;
 }

@@ -1,5 +1,5 @@
 // The rows of an experiment as a chart: one column over another, with its intervals.
-import { html, useLayoutEffect, useRef, useState } from "./common.js";
+import { colourOf, drawPlot, html, useLayoutEffect, useRef, useState } from "./common.js";
 
 const HEIGHT = 220;
 const COLOURS = ["thrust", "phi", "fy", "fin", "alpha", "fx"];
@@ -33,11 +33,10 @@ export function Rows({ result: { columns, labels, name: run, force_unit: forceUn
     const scaled = (column, row) => (column[row] == null ? null : factor * column[row]);
     const data = [order.map((row) => scale * columns[x][row]),
       ...groups.map((group) => order.map((row) => (labels[row] === group ? scaled(columns[y], row) : null)))];
-    const style = getComputedStyle(document.documentElement), colour = (name) => style.getPropertyValue(`--${name}`);
-    const axis = { stroke: () => colour("muted"), font: "11px system-ui, sans-serif", ticks: { show: false }, grid: { stroke: () => colour("grid"), width: 1 } };
+    const colour = (index) => colourOf(COLOURS[index % COLOURS.length]);
     const drawBars = (plot, index) => {
       const { ctx } = plot;
-      ctx.strokeStyle = colour(COLOURS[(index - 1) % COLOURS.length]);
+      ctx.strokeStyle = colour(index - 1);
       ctx.beginPath();
       order.forEach((row, place) => {
         const value = data[index][place], error = scaled(half, row);
@@ -51,21 +50,15 @@ export function Rows({ result: { columns, labels, name: run, force_unit: forceUn
     const range = (low, high) => [low - 0.05 * (high - low || 1), high + 0.05 * (high - low || 1)];
     const known = order.flatMap((row) => [-1, 1].map((sign) => scaled(columns[y], row) + sign * (scaled(half, row) ?? 0)));
     const ends = known.length > 0 ? known : [0, 1];
-    const plot = new globalThis.uPlot({
-      width: node.current.clientWidth, height: HEIGHT, padding: [10, 12, 0, 0], legend: { show: false },
-      cursor: { drag: { x: false, y: false } }, hooks: { drawSeries: [drawBars] },
+    const [, remove] = drawPlot(node.current, {
+      height: HEIGHT, padding: [10, 12, 0, 0], hooks: { drawSeries: [drawBars] },
       scales: { x: { time: false, range: (_, low, high) => range(low ?? 0, high ?? 1) }, y: { range: () => range(Math.min(...ends), Math.max(...ends)) } },
-      axes: [{ ...axis, size: 24 }, { ...axis, size: 52 }],
+      axes: [{ size: 24 }, { size: 52 }],
       series: [{}, ...groups.map((_, index) => ({
-        stroke: colour(COLOURS[index % COLOURS.length]), paths: () => null, points: { show: true, size: 7, fill: colour(COLOURS[index % COLOURS.length]) },
+        stroke: colour(index), paths: () => null, points: { show: true, size: 7, fill: colour(index) },
       }))],
-    }, data, node.current);
-    const watch = new ResizeObserver(([{ contentRect }]) => contentRect.width > 0 && plot.setSize({ width: contentRect.width, height: HEIGHT }));
-    watch.observe(node.current);
-    return () => {
-      watch.disconnect();
-      plot.destroy();
-    };
+    }, data);
+    return remove;
   }, [columns, x, y]);
   const titleOf = (name) => {
     const [title, , unit] = quantityOf(name, forceUnit);

@@ -25,16 +25,22 @@ def test_the_axis_is_drawn_where_it_lies() -> None:
     assert rows_of(drawn, drawing.AXIS_COLOUR, 39) == [26]
 
 
-def test_in_a_whole_picture_it_is_drawn_within_what_frames_show() -> None:
+def test_in_an_enlarged_picture_it_is_drawn_at_the_same_place() -> None:
+    large = drawing.enlarge(drawing.to_colours(GREY[:40, :40]))
+    drawn = drawing.draw_axis(large, Axis(offset=4.5), 40)
+    assert 24 * 16 < np.mean(rows_of(drawn, drawing.AXIS_COLOUR, 320)) < 25 * 16
+
+
+def test_in_a_whole_picture_what_frames_show_is_outlined() -> None:
     crop = Crop(left=0.25, top=0.25, width=0.5, height=0.5)
-    drawn = drawing.draw_axis(drawing.to_colours(GREY), Axis(offset=0.0), 84, crop)
-    assert rows_of(drawn, drawing.AXIS_COLOUR, 30) == [20]
-    assert rows_of(drawn, drawing.AXIS_COLOUR, 5) == []
+    drawn = drawing.draw_crop(drawing.to_colours(GREY), crop)
     assert rows_of(drawn, drawing.CROP_COLOUR, 30) == [10, 30]
+    assert rows_of(drawn, drawing.CROP_COLOUR, 5) == []
+    whole = Crop(left=0.0, top=0.0, width=1.0, height=1.0)
+    assert rows_of(drawing.draw_crop(drawing.to_colours(GREY), whole), drawing.CROP_COLOUR, 0) == []
 
 
 def test_a_file_shows_the_same_colours(tmp_path: Path) -> None:
-    drawing.write_png(tmp_path / "a.png", drawing.draw_axis(drawing.to_colours(GREY), None, 40))
     red = np.zeros((4, 4, 3), np.uint8)
     red[:, :, 0] = 255
     drawing.write_png(tmp_path / "red.png", drawing.enlarge(red))

@@ -84,7 +84,7 @@ def test_it_finds_fish_and_rig_from_forces_and_commands(identification: Identifi
         )
     assert identification["servo_delay"].value == pytest.approx(0.04, abs=5e-4)
     assert identification["backlash"].value == pytest.approx(0.02, abs=1e-3)
-    # Its configured value, as forces do not determine it.
+    # Forces do not determine it, so it has its configured value.
     assert identification["lateral_inertia_ratio"].value == 1.0
     assert identification.remarks == ()
     assert identification.failed_assumptions == ()

@@ -13,9 +13,9 @@ TIMES = np.arange(1, 601) * 2e-3
 
 @pytest.mark.parametrize("xi", [1e-3, 0.2, 1.2, 2.0, 5.0])
 def test_the_oscillator_of_a_response_is_found(xi: float) -> None:
-    found = fit(0.2, TIMES, response(TIMES, 12.5, xi, 0.03))
-    assert (found.omega0, found.xi, found.angle) == pytest.approx((12.5, xi, 0.03), rel=1e-4)
-    assert found.misfit < 1e-5
+    fitted = fit(0.2, TIMES, response(TIMES, 12.5, xi, 0.03))
+    assert (fitted.omega0, fitted.xi, fitted.angle) == pytest.approx((12.5, xi, 0.03), rel=1e-4)
+    assert fitted.misfit < 1e-5
 
 
 def test_a_response_is_the_solution_of_its_equation() -> None:
@@ -40,7 +40,7 @@ def test_the_default_swimmer_has_the_natural_frequency_and_the_damping_of_the_ro
     """The paper matches its body to the robot's ω₀ = 12.5 rad/s and ξ = 1.2."""
     monkeypatch.setattr(step_response, "PERIODS", 1.8)  # after which the tail hardly moves
     settings = load(ROOT / "config" / "swimmer.yaml").swimmer
-    found = fit(activation, *swim_step(settings, activation))
-    assert found.omega0 == pytest.approx(12.5, abs=0.3)
-    assert found.xi == pytest.approx(1.2, abs=0.15)
-    assert found.misfit < 0.01
+    fitted = fit(activation, *swim_step(settings, activation))
+    assert fitted.omega0 == pytest.approx(12.5, abs=0.3)
+    assert fitted.xi == pytest.approx(1.2, abs=0.15)
+    assert fitted.misfit < 0.01
