@@ -224,6 +224,13 @@ def read_pulses(config: Config) -> bool | None:
         return SERVOS.find(config.servo.driver).read_pulses(config.servo)
 
 
+def read_calibrations(config: Config) -> None:
+    """Read the newest calibrations of this robot; raise `ConfigError` for a bad file."""
+    folder = CalibrationFolder(state_folder(config))
+    folder.newest(ForceCalibration)
+    folder.newest(ServoCalibration)
+
+
 def _servo_calibration(config: Config) -> ServoCalibration:
     newest = CalibrationFolder(state_folder(config)).newest(ServoCalibration)
     return newest[0] if newest else config.servo.calibration

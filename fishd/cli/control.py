@@ -109,7 +109,7 @@ def clear_fault(endpoint: str | None, as_json: bool) -> None:
 def restart(endpoint: str | None, as_json: bool) -> None:
     """Let systemd restart the daemon, which then reads its configuration again.
 
-    Refused while the fish swims, and if the configuration is wrong.
+    Refused while the fish swims or an experiment has it, and if the configuration is wrong.
     """
     _change(endpoint, as_json, client.Fish.restart)
 

@@ -160,7 +160,11 @@ def identify(
     for remark in identification.remarks:
         echo(f"fishctl: careful: {remark}", err=True)
     if target:
-        _write_config(target, identification.to_yaml(f"{origin} on {datetime.now():%Y-%m-%d}"))
+        content = identification.to_yaml(f"{origin} on {datetime.now():%Y-%m-%d}")
+        with files.os_errors(FishdError, f"{target}: cannot be written"):
+            files.write_atomically(target, content)
+        command = f"fishctl simulate swing --config {shlex.quote(str(target))}"
+        echo(f"{target}: written; to swim it: {command}", err=run.as_json)
     if run.kept_picture:
         from fishd.lab.identification.figure import draw
 
@@ -274,14 +278,6 @@ class EarlyFits:
             name, value, low, high, unit = known[0]
             point = CurvePoint(result["seconds"], value, (high - low) / 2, "time [s]", name, unit)
             self._show.estimate([Estimate(*values) for values in known], point)
-
-
-def _write_config(target: Path, text: str) -> None:
-    with files.os_errors(FishdError, f"{target}: cannot be written"):
-        files.write_atomically(target, text)
-    echo(
-        f"{target}: written; to swim it: fishctl simulate swing --config {shlex.quote(str(target))}"
-    )
 
 
 def _print_result(identification: "Identification", origin: str) -> None:

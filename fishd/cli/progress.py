@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 REPORT_PERIOD_S = 0.5
 """Shortest time between two reports of the amount alone [s]."""
+WIDTH_BESIDE_BAR = 48
+"""Characters for the amount and the times beside a bar."""
 
 
 class Lines:
@@ -179,16 +181,18 @@ def show_progress(total: float, unit: str, *, err: bool = False) -> Iterator[Lin
             if self.tasks and self.tasks[0].description:
                 yield Text(self.tasks[0].description)
 
-    columns = (
-        TextColumn("{task.completed:.0f} of {task.total:.0f} " + unit),
-        BarColumn(bar_width=30),
-        TimeElapsedColumn(),
-        TextColumn("passed,"),
-        TimeRemainingColumn(),
-        TextColumn("left"),
-    )
     # Output that other code prints meanwhile must not be redirected.
     console = Console(stderr=True)
+    bar_width = min(30, console.width - WIDTH_BESIDE_BAR)
+    has_bar = bar_width >= 5  # else the times would be cut off instead
+    columns = (
+        TextColumn("{task.completed:.0f} of {task.total:.0f} " + unit),
+        *([BarColumn(bar_width=bar_width)] if has_bar else []),
+        TimeElapsedColumn(),
+        TextColumn("passed,"),
+        TimeRemainingColumn(compact=not has_bar),
+        TextColumn("left"),
+    )
     with ProgressWithResult(*columns, console=console, redirect_stdout=False) as progress:
         yield Bar(progress, progress.add_task("", total=total), err)
 

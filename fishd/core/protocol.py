@@ -269,8 +269,9 @@ OPERATIONS = {
     "restart": Operation(
         NoArguments,
         _STATE,
-        "fades to neutral and ends; systemd starts `fishd` again. Refused while a controller runs, "
-        "in mode estop, without systemd, or if the configuration is wrong now",
+        "fades to neutral and ends; systemd starts `fishd` again, unless an emergency stop comes "
+        "meanwhile. Refused while a controller runs or a lease is held, in mode estop, without "
+        "systemd, or if the configuration, a calibration or a key is wrong now",
     ),
     "take-lease": Operation(
         TakeLease,

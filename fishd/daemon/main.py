@@ -34,7 +34,7 @@ from fishd.core.process.systemd_notify import SystemdNotifier
 from fishd.daemon.calibration_requests import CalibrationRequests
 from fishd.daemon.control_server import ControlServer
 from fishd.daemon.direct_sockets import open_at_file, open_in_kernel
-from fishd.daemon.gateway.gateways import Gateways, Telemetry
+from fishd.daemon.gateway.gateways import Gateways, Telemetry, read_keys
 from fishd.daemon.requests import Access, Operations, Restart
 from fishd.daemon.socket_files import SocketWatch
 from fishd.daemon.virtual_pace import Lockstep, SlowMotion
@@ -68,9 +68,9 @@ class Daemon:
         """file, overrides: what the configuration was read from"""
         self._config = config
         self._file = file
-        self._read_config = partial(load, file, overrides)
-        self.restarts = False
-        """Whether systemd shall start fishd again when it has ended."""
+        self._overrides = overrides
+        self._restarts = False
+        """Whether a client requested that systemd starts fishd again."""
         self._print_status = print_status
         self._slow: SlowMotion | None = None
         if not config.kind.is_real_time:
@@ -129,9 +129,7 @@ class Daemon:
                 controllers,
                 self.is_realtime,
                 self._access,
-                Restart(self._read_config, self._end_for_restart)
-                if self._notifier.is_service
-                else None,
+                self._find_restart,
             )
             self._server = ControlServer(self._operations.perform, config.tick)
             self._gateways.serve(self._server, self._loop.reporter)
@@ -213,10 +211,32 @@ class Daemon:
         finally:
             ticker.close()
 
+    def _find_restart(self) -> Restart | None:
+        has_systemd = self._notifier.is_service
+        return Restart(self._check_config, self._end_for_restart) if has_systemd else None
+
+    def _check_config(self) -> None:
+        """Read the files of the next start, with their keys; raise `ConfigError`."""
+        config = load(self._file, self._overrides)
+        if config.network.keys:
+            read_keys(config.network.keys)
+        if config.kind.has_hardware:
+            assembly.read_calibrations(config)
+
     def _end_for_restart(self) -> None:
         log.info("a restart was requested")
-        self.restarts = True
+        self._restarts = True
         signal.raise_signal(signal.SIGTERM)  # the way of each end, also of a loop that hangs
+
+    def shall_restart(self) -> bool:
+        """Return whether systemd shall start fishd again, once it has ended."""
+        if self._restarts and self._loop.supervisor.mode is Mode.ESTOP:
+            log.warning(
+                "an emergency stop came during the restart, so fishd is not started again; start "
+                "it with 'sudo systemctl start fishd'"
+            )
+            return False
+        return self._restarts
 
     def _between_ticks(self) -> None:
         """Do housekeeping, one job at a time, so that it fits between two ticks of 2 ms."""
@@ -322,7 +342,7 @@ async def swim(
         await asyncio.sleep(0)  # lets an earlier signal set `stopping`
         if not stopping.is_set():
             await daemon.run(stopping)
-    return daemon.restarts
+    return daemon.shall_restart()
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})

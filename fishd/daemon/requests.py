@@ -48,8 +48,8 @@ class Access(NamedTuple):
 class Restart(NamedTuple):
     """How fishd is started again by systemd."""
 
-    read_config: Callable[[], Config]
-    """Function that reads the configuration that it will have; it raises `ConfigError`."""
+    check_config: Callable[[], object]
+    """Function that reads all that its start will read; it raises `ConfigError`."""
     end: Callable[[], None]
     """Function that lets it end for that."""
 
@@ -66,7 +66,7 @@ class Operations:
         controllers: list[ControllerInfo],
         realtime: bool,
         access: Callable[[], "Access"] = Access,
-        restart: Restart | None = None,
+        restart: "Callable[[], Restart | None]" = lambda: None,
     ) -> None:
         """Prepare to answer requests.
 
@@ -74,12 +74,12 @@ class Operations:
         controllers: controllers that can be made active
         realtime: whether the loop runs under SCHED_FIFO
         access: function that returns how clients reach this fishd
-        restart: how systemd starts it again; None if it does not
+        restart: function that returns how systemd starts it again; None if it does not
         """
         self._loop = loop
         self._clock = clock
         self._realtime = realtime
-        self._systemd = restart
+        self._find_restart = restart
         self._access = access
         self._calibrations = calibration_requests
         self._config = config
@@ -326,17 +326,17 @@ class Operations:
         return self._state()
 
     async def _restart(self, _: protocol.NoArguments) -> State:
-        systemd = self._systemd
+        systemd = self._find_restart()
         if systemd is None:
             raise Refused(
                 "no-service",
-                "fishd is no service of systemd, which would start it again: end and start it by "
-                "hand",
+                "fishd is not a service of systemd, which would start it again; end it and start "
+                "it by hand",
             )
         self._check_may_end()
         self._calls.check_busy()
         try:
-            await self._calls.call("the configuration has not been read", systemd.read_config)
+            await self._calls.call("the configuration has not been read", systemd.check_config)
         except ConfigError as error:
             raise Refused("bad-configuration", text.error_message(error)) from None
         self._check_may_end()
@@ -344,8 +344,9 @@ class Operations:
         return self._state()
 
     def _check_may_end(self) -> None:
-        """Raise `Refused` while a controller runs, and while an E-stop is latched."""
+        """Raise `Refused` while a program has or drives the fish, or an E-stop is latched."""
         loop = self._loop
+        loop.lease.check_free()
         if loop.supervisor.mode is Mode.RUNNING:
             raise Refused(
                 "running", f"{loop.active.name} drives the fish; first stop it with 'fishctl stop'"

@@ -8,7 +8,7 @@ import stat
 import time
 import zipfile
 from calendar import timegm
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import IO
@@ -31,6 +31,8 @@ PACKED_SUFFIXES = (SUFFIX, ".png", ".parquet", ".onnx", ".zip")
 _NAME = re.compile(r"(?!latest$|.*\.(part|json|txt|lock|runner)$)\w[\w. -]{0,99}(?<! )")
 """Names of runs, which are neither another word for a run nor those of other files there."""
 _ID, _ID_FORMAT = re.compile(r"\d{8}-\d{6}(-\d+)?", re.A), "%Y%m%d-%H%M%S"
+_REMOVED = "removed-"
+"""Beginning of the name of a deleted run's folder while it is removed."""
 _READ_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 
 
@@ -139,33 +141,51 @@ def restore_run(deleted_id: str, folder: Path) -> Path:
     raise RecordingError(f"the trash has no '{text.quoted(deleted_id)}'; see 'fishctl runs trash'")
 
 
-def empty_trash(folder: Path, days: float = 0.0) -> int:
-    """Remove what has been in the trash for longer than this time; return the number of runs."""
-    places = [p for p in _list_places(folder) if time.time() - _deletion_time(p) >= days * 86400]
-    for place in places:
-        with _os_errors(place, "cannot be removed"), suppress(FileNotFoundError):
-            shutil.rmtree(place)
-    return len(places)
+def empty_trash(folder: Path, days: float = 0.0, ids: Collection[str] = ()) -> int:
+    """Remove what has been in the trash for longer than this time; return the number of runs.
+
+    ids: the only runs to remove; all by default
+    Raise `RecordingError` for a run that cannot be removed, after the others are.
+    """
+    runs, problem = 0, None
+    for place in list(_list_places(folder, is_removal=True)):
+        is_meant = not ids or place.name.removeprefix(_REMOVED) in ids
+        if not is_meant or time.time() - _deletion_time(place) < days * 86400:
+            continue
+        try:
+            with _os_errors(place, "cannot be removed"), suppress(FileNotFoundError):
+                removed = place
+                if not place.name.startswith(_REMOVED):  # no part of it can be restored
+                    removed = place.rename(place.with_name(_REMOVED + place.name))
+                shutil.rmtree(removed)
+                runs += 1
+        except RecordingError as error:
+            problem = problem or error
+    if problem:
+        raise problem
+    return runs
 
 
 def pack_run(path: Path, stream: IO[bytes]) -> None:
     """Write the files of a run as a zip file into a stream, with little memory; raise OSError.
 
-    Links, pipes and locks are left out.
+    Links, pipes and locks are left out. Raise `RecordingError` if the run is removed meanwhile.
     """
-    name = _name_of(path)
-    with zipfile.ZipFile(stream, "w", strict_timestamps=False) as archive:
-        if not path.is_dir():
-            folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-            try:
+    name, is_folder = _name_of(path), path.is_dir()
+    place = os.open(path if is_folder else path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with zipfile.ZipFile(stream, "w", strict_timestamps=False) as archive:
+            if not is_folder:
                 for file in (path.name, note_path(path).name):
-                    _pack_file(archive, file, folder, name)
-            finally:
-                os.close(folder)
-            return
-        for root, _, names, folder in os.fwalk(path):
-            for file in sorted(names):
-                _pack_file(archive, file, folder, str(name / Path(root).relative_to(path)))
+                    _pack_file(archive, file, place, name)
+                return
+            for root, _, names, folder in os.fwalk(".", dir_fd=place):
+                for file in sorted(names):
+                    _pack_file(archive, file, folder, str(Path(name, root)))
+            if not os.access(EXPERIMENT, os.F_OK, dir_fd=place):
+                raise RecordingError(f"{name} was removed before all of it was packed")
+    finally:
+        os.close(place)
 
 
 def _pack_file(archive: zipfile.ZipFile, name: str, folder: int, place: str) -> None:
@@ -221,18 +241,21 @@ def _move(path: Path, target: Path) -> None:
         note.rename(new_note)
 
 
-def _list_places(folder: Path) -> Iterator[Path]:
-    """Yield the folder of each deleted run."""
+def _list_places(folder: Path, *, is_removal: bool = False) -> Iterator[Path]:
+    """Yield the folder of each deleted run; for a removal also what is left of an earlier one."""
     trash = folder / TRASH
     with _os_errors(trash, "cannot be read"), suppress(FileNotFoundError):
         if not trash.is_symlink():
-            yield from (path for path in trash.iterdir() if _ID.fullmatch(path.name))
+            for path in trash.iterdir():
+                name = path.name.removeprefix(_REMOVED) if is_removal else path.name
+                if _ID.fullmatch(name):
+                    yield path
 
 
 def _deletion_time(place: Path) -> float:
     """Return the time in the name of the folder of a deleted run [s, unix]."""
     try:
-        return timegm(time.strptime(place.name[:15], _ID_FORMAT))
+        return timegm(time.strptime(place.name.removeprefix(_REMOVED)[:15], _ID_FORMAT))
     except ValueError:
         return 0.0
 

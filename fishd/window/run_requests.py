@@ -29,6 +29,12 @@ class NewName(Struct, forbid_unknown_fields=True):
     name: Annotated[str, Meta(pattern=PRINTABLE, max_length=100)]
 
 
+class DeletedRuns(Struct, forbid_unknown_fields=True):
+    """Body of empty: what the user saw in the trash, as another device may delete a run since."""
+
+    ids: Annotated[list[str], Meta(min_length=1)]
+
+
 class RunRequests:
     """The requests about runs."""
 
@@ -53,7 +59,7 @@ class RunRequests:
             access.get("/api/results.png", self._draw_results, waiting),
             access.get("/api/trash", lambda _: runs.call_verb("trash"), waiting),
             access.post("/api/trash/{id}/restore", self._restore, NoArguments, waiting=waiting),
-            access.post("/api/trash/empty", self._empty_trash, NoArguments, waiting=waiting),
+            access.post("/api/trash/empty", self._empty_trash, DeletedRuns, waiting=waiting),
         ]
 
     async def _download(self, request: web.Request) -> web.StreamResponse:
@@ -69,8 +75,8 @@ class RunRequests:
     async def _restore(self, request: web.Request, _: NoArguments) -> Any:
         return await self._runs.change("restore", check_name(request.match_info["id"]))
 
-    async def _empty_trash(self, _request: web.Request, _: NoArguments) -> Any:
-        return await self._runs.call_verb("trash", options=["--empty"])
+    async def _empty_trash(self, _: web.Request, body: DeletedRuns) -> Any:
+        return await self._runs.call_verb("trash", *map(check_name, body.ids), options=["--empty"])
 
     async def _show_results(self, request: web.Request) -> Any:
         return await self._runs.call_verb("show", *_list_compared(request))

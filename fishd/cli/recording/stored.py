@@ -64,12 +64,18 @@ def delete(runs: tuple[str, ...], folder: Path, as_json: bool) -> None:
 
 
 @click.command()
-@click.option("--empty", is_flag=True, help="Remove all that is in the trash.")
+@click.argument("ids", nargs=-1, metavar="[ID]...")
+@click.option("--empty", is_flag=True, help="Remove all that is in the trash, or each ID.")
 @_options
-def trash(empty: bool, folder: Path, as_json: bool) -> None:
-    """List the deleted runs, the latest first, or remove them."""
+def trash(ids: tuple[str, ...], empty: bool, folder: Path, as_json: bool) -> None:
+    """List the deleted runs, the latest first, or remove them.
+
+    ID is the first word of a line of this list.
+    """
+    if ids and not empty:
+        raise click.UsageError("an ID goes with --empty")
     if empty:
-        count = stored_runs.empty_trash(folder)
+        count = stored_runs.empty_trash(folder, ids=ids)
         echo(f"{format_count(count, 'run')} removed", err=as_json)
     deleted = stored_runs.list_trash(folder)
     if as_json:

@@ -6,6 +6,7 @@ nothing is sent.
 
 import os
 import socket
+from contextlib import suppress
 
 _FEEDS_PER_LIMIT = 8
 """Number of watchdog notifications in the time that systemd allows."""
@@ -24,8 +25,13 @@ class SystemdNotifier:
 
     @property
     def is_service(self) -> bool:
-        """Whether systemd has started this process and waits for its messages."""
-        return bool(self._address)
+        """Whether systemd has started this process and takes its messages."""
+        if not self._address:
+            return False
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe, suppress(OSError):
+            probe.connect(self._address)
+            return True
+        return False
 
     def ticked(self, now: float) -> None:
         """Feed the watchdog, and report readiness with the first tick; call it only from the tick.

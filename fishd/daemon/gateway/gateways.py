@@ -305,7 +305,7 @@ class Gateways:
         self.keyed_telemetry = self.keyed_control = ""
         """Addresses for clients with a key; empty without keys."""
         if network:
-            keyed = Gateway("network", _read_keys(network.keys or ""))
+            keyed = Gateway("network", read_keys(network.keys or ""))
             self._gateways.append(keyed)
             key = "network.control"
             self.keyed_control = keyed.listen(CONTROL, network.control, key, stack).address
@@ -355,7 +355,7 @@ class Gateways:
         }
 
 
-def _read_keys(name: str) -> str:
+def read_keys(name: str) -> str:
     """Return fishd's secret key and its folder; raise `ConfigError` for a wrong file there."""
     from fishd.core import keys
 

@@ -21,16 +21,16 @@ export function Trash({ page, changes, changed }) {
         : html`<p class="muted">Kept for 30 days.</p>
           <ul>${deleted.map((run) => html`<li key=${run.id}><span>${run.name}</span> <span class="muted">deleted ${date.format(run.deleted * 1000)}</span>
             <button type="button" disabled=${isOff} aria-label=${`Restore ${run.name}`} onClick=${() => restore(page, run, changed)}>Restore</button></li>`)}</ul>
-          <${Emptying} key=${deleted.length} ...${{ count: deleted.length, page, changed, isOff }} />`)}</div>`;
+          <${Emptying} key=${deleted.length} ...${{ ids: deleted.map(({ id }) => id), page, changed, isOff }} />`)}</div>`;
 }
 
 /** The button that empties the trash, and asks first; where it was, a second press of it keeps all. */
-function Emptying({ count, page, changed, isOff }) {
+function Emptying({ ids, page, changed, isOff }) {
   const [isAsking, setAsking] = useState(false);
   const empty = () => {
     setAsking(false);
-    call("POST", "/api/trash/empty", {}, CHECK_TIMEOUT_MS).catch((error) => page.notice("error", error.message, error.remedy)).then(changed);
+    call("POST", "/api/trash/empty", { ids }, CHECK_TIMEOUT_MS).catch((error) => page.notice("error", error.message, error.remedy)).then(changed);
   };
   return html`<div class="buttons"><button type="button" disabled=${isOff} onClick=${() => setAsking(!isAsking)}>${isAsking ? "Keep" : "Empty trash"}</button>
-    ${isAsking && html`<button type="button" class="stop" onClick=${empty}>Remove ${count === 1 ? "this run" : `these ${count} runs`} permanently</button>`}</div>`;
+    ${isAsking && html`<button type="button" class="stop" onClick=${empty}>Remove ${ids.length === 1 ? "this run" : `these ${ids.length} runs`} permanently</button>`}</div>`;
 }

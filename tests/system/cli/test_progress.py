@@ -63,6 +63,16 @@ def test_values_are_whole_below_the_bar() -> None:
     assert "left" in lines[place - 1]
 
 
+@pytest.mark.parametrize("columns", [40, 60])
+def test_times_are_whole_on_a_narrow_terminal(
+    columns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    _, shown = run_on_terminal(VALUES.replace("2.0", "180.0"))
+    assert "passed, " in shown
+    assert "…" not in shown
+
+
 def test_work_of_unknown_length_is_named_on_a_terminal_only() -> None:
     out, shown = run_on_terminal(WAITING)
     assert out == "fitted\n"

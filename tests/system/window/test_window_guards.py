@@ -40,7 +40,7 @@ CHANGES = [
     ("/api/runs/x/rename", {"name": "y"}),
     ("/api/runs/x/delete", {}),
     ("/api/trash/20260101-000000/restore", {}),
-    ("/api/trash/empty", {}),
+    ("/api/trash/empty", {"ids": ["x"]}),
 ]
 
 

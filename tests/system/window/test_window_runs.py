@@ -81,8 +81,10 @@ async def test_the_trash_is_emptied(window: WindowProcess, runs: Path) -> None:
     async with Browser(window.url) as browser:
         for name in ("first.mcap", "swept"):
             await browser.post(f"/api/runs/{name}/delete")
-        assert await browser.post("/api/trash/empty") == []
-        assert await browser.get("/api/trash") == []
+        second, first = await browser.get("/api/trash")  # another device deletes the second later
+        assert await browser.post("/api/trash/empty", {"ids": [first["id"]]}) == [second]
+        assert await browser.refusal("/api/trash/empty", {"ids": []}) == (400, "bad-arguments")
+        assert await browser.post("/api/trash/empty", {"ids": [second["id"], "gone"]}) == []
         assert list(runs.rglob("*.mcap")) == []
 
 
@@ -174,7 +176,7 @@ CHANGES = {
     "/api/runs/first.mcap/rename": {"name": "x"},
     "/api/runs/first.mcap/delete": {},
     "/api/trash/20260101-000000/restore": {},
-    "/api/trash/empty": {},
+    "/api/trash/empty": {"ids": ["x"]},
 }
 READS = (
     "/api/trash", "/api/results?run=first.mcap", "/api/results.png?run=first.mcap",

@@ -33,8 +33,9 @@ def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_pat
     assert find_answer(folder).summary.startswith("omega0=1")
 
     words = ("--fit", "omega0, xi, coupling", "--fix", "coupling", "--set", "plant.omega0=11")
-    second = invoke(str(record), *words, "--json")
+    second = invoke(str(record), *words, "--json", "--to", str(fish), "--force")
     assert second.exit_code == 0
+    assert f"{fish}: written" in second.stderr
     result = json.loads(second.stdout)
     assert result["origin"] == "identify.mcap"
     estimates = result["estimates"]

@@ -9,11 +9,13 @@ import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rigs.processes import fishctl, one_line
 from rigs.recordings import record_run, swum
 
+from fishd.core.errors import RecordingError
 from fishd.core.process.lockfile import locked
 from fishd.lab.experiment import Header, open_experiment
 from fishd.recording import RunWriter, open_run, stored_runs
@@ -245,10 +247,32 @@ def test_two_programs_delete_and_empty_at_once(
     )
     assert delete_run(folder / "swept").id != place.name
     gone = folder / TRASH / "20260101-000000"
-    monkeypatch.setattr(stored_runs, "_list_places", lambda _: [gone, place])
+    monkeypatch.setattr(stored_runs, "_list_places", lambda *_, **__: [gone, place])
     assert [run.name for run in list_trash(folder)] == ["first"]
     empty_trash(folder)
     assert list_trash(folder) == []
+
+
+def test_a_run_that_cannot_be_removed_keeps_no_other_and_is_no_part_of_a_run(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for run in ("first.mcap", "swept"):
+        delete_run(folder / run)
+    remove, (kept, _) = shutil.rmtree, sorted((folder / TRASH).iterdir())
+
+    def fail(path: Path) -> None:
+        if path.name.endswith(kept.name):
+            raise PermissionError(errno.EPERM, "not permitted")
+        remove(path)
+
+    monkeypatch.setattr(shutil, "rmtree", fail)
+    done = fishctl("runs", "--folder", str(folder), "trash", "--empty")
+    assert "cannot be removed: not permitted" in one_line(done)
+    assert list_trash(folder) == []
+    assert len([*(folder / TRASH).iterdir()]) == 1
+    monkeypatch.undo()
+    assert empty_trash(folder) == 1
+    assert [*(folder / TRASH).iterdir()] == []
 
 
 def test_a_trash_that_is_a_link_takes_nothing(
@@ -260,6 +284,18 @@ def test_a_trash_that_is_a_link_takes_nothing(
     (outside / "20000101-000000").mkdir()
     assert empty_trash(folder) == 0
     assert (outside / "20000101-000000").is_dir()
+
+
+def test_a_run_that_is_removed_while_it_is_packed_is_no_zip_file(folder: Path) -> None:
+    class Stream(io.BytesIO):
+        def write(self, data: Any) -> int:
+            if (folder / "swept").exists():
+                delete_run(folder / "swept")
+                empty_trash(folder)
+            return super().write(data)
+
+    with pytest.raises(RecordingError, match="swept was removed before all of it was packed"):
+        stored_runs.pack_run(folder / "swept", Stream())
 
 
 def make_fifo(path: Path) -> None:
