@@ -6,7 +6,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from rigs.processes import PATIENCE, Daemon, running, sets
+from rigs.processes import PATIENCE, Daemon, running, sets, wait_until
 
 from fishd.client import Fish
 from fishd.config import load
@@ -55,7 +55,7 @@ def test_files_with_which_it_would_not_start_are_refused_and_the_fish_goes_on(
             assert refused.code == "bad-configuration"
             assert problem in str(refused)
         first = fish.status()
-        assert fish.status().seq >= first.seq
+        wait_until(lambda: fish.status().seq > first.seq)
         assert (first.mode, first.name) == ("idle", "pike")
 
 

@@ -406,7 +406,10 @@ def test_a_service_that_rests_is_restarted_from_the_page(service: Daemon, tmp_pa
         go(page, "fish")
         restart = page.get_by_role("button", name="Restart fishd")
         expect(restart).to_be_disabled()
-        service.at_rest()
+        go(page, "live")
+        page.click("#stop")
+        go(page, "fish")
+        expect(restart).to_be_enabled()
         restart.click()
         assert service.process.wait(PATIENCE) == os.EX_TEMPFAIL
         expect(page.locator("#connection")).to_contain_text("lost")
