@@ -1,7 +1,6 @@
 """Command `fishd-camera`, which publishes the frames of a camera until a signal ends it."""
 
 import logging
-import os
 import stat
 import threading
 from contextlib import suppress
@@ -20,8 +19,6 @@ from fishd.core.process.shutdown import exit_now
 
 log = logging.getLogger(__name__)
 NAME = "fishd-camera"
-NICE = 5
-"""Lowest niceness of the process: frames may be late, ticks of fishd may not."""
 
 
 def open_source(settings: CameraSettings) -> Source:
@@ -62,7 +59,6 @@ def camera(path: Path | None, overrides: tuple[str, ...], log_format: str) -> in
     settings are wrong.
     """
     settings = load(path, overrides)
-    os.nice(max(0, NICE - os.nice(0)))
     try:
         from fishd.camera.measuring import learned_path
         from fishd.camera.server import Server

@@ -27,6 +27,8 @@ OPTIONS: Options = {
     "--rate": {"type": float, "default": 60.0, "help": "pictures per second; default 60"},
 }
 NONE, IDLE, MEASURING = "no camera", "a camera that does not measure", "a camera that measures"
+NICE = 5
+"""Niceness of the camera, as in its service."""
 SETTLE_S = 1.0
 """Time that a camera runs before lateness counts [s]."""
 
@@ -35,7 +37,7 @@ class Turn(NamedTuple):
     """Results beside one camera, or none, in one round."""
 
     lateness: list[float]
-    """Of each tick [µs]."""
+    """Lateness of each tick [µs]."""
     measured: float = 0.0
     """Measured pictures per second."""
     memory: float = 0.0
@@ -52,7 +54,8 @@ class Camera(Process):
             f"publish.frames=ipc://{fishd.folder}/frames",
         )
         source = f"simulated.fishd={fishd.endpoint}"
-        super().__init__(str(BIN / "fishd-camera"), *sets(*addresses, source, *settings))
+        command = [str(BIN / "fishd-camera"), *sets(*addresses, source, *settings)]
+        super().__init__("nice", f"--adjustment={NICE}", *command)  # which becomes the command
         self._requests = CameraRequests(self.address, TIMEOUT_S)
         deadline = time.monotonic() + TIMEOUT_S
         while time.monotonic() < deadline:

@@ -167,11 +167,6 @@ def test_a_port_that_is_taken_is_that_of_another_camera_perhaps(tmp_path: Path) 
 
 
 @pytest.mark.realtime
-def test_frames_may_be_late_where_ticks_may_not(both: Both) -> None:
-    daemon, camera = (os.getpriority(os.PRIO_PROCESS, process.process.pid) for process in both)
-    assert camera == max(5, daemon)
-
-
 def test_a_frame_is_young_when_a_learner_has_it(camera: CameraProcess) -> None:
     ages: list[float] = []
     with camera.client() as client:
