@@ -39,10 +39,10 @@ _MIN_FIN_SEEN = 0.6
 """Smallest fraction of the fin's stations that must be seen."""
 _MAX_SHAPE_ERROR = 0.004
 """Permitted distance of a midline from the learned shape, relative to the picture's width. The
-permitted root mean square of the latest ones is half of it."""
+permitted mean of the latest ones is half of it."""
 _USUAL_ERROR, _USUAL_RECENT_ERROR = 1.5, 1.0
-"""Permitted distance, and permitted root mean square of the latest ones, relative to the distance
-that 95 % of the learned pictures stay below; they count if they are larger."""
+"""Permitted distance, and permitted mean of the latest ones, relative to the distance that 95 % of
+the learned pictures stay below; they count if they are larger."""
 _MIN_DIFFERENCE_RAD, _MAX_DIFFERENCE_RAD = 0.03, 0.045
 """Range of the permitted difference of the fin's direction from that by the learned shape [rad]."""
 _USUAL_DIFFERENCE = 3.0
@@ -211,6 +211,7 @@ class TailMeter:
         seen = self._look(trace, lag - lag[self._fin].mean(), time)
         reason = self._find_fault(seen, small, light, cover, places, time)
         alpha, uncertainty = None, None
+        # Also of a tail that seems turned, as the next picture is corrected for the fin's speed.
         if seen is not None and (not reason or (reason == _OTHER_SHAPE and self._is_whole(seen))):
             alpha, uncertainty = self._weigh(seen)
             if self._last is not None and time > self._last[0]:
