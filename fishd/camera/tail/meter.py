@@ -298,8 +298,8 @@ class TailMeter:
         if seen is None:
             return self._find_lamp(small, places) or "too little of the fin is seen"
         differs = abs(seen.alpha - seen.fit.alpha) > self._max_difference
-        is_other = differs or self._is_distant(seen.fit.error, time)
-        is_other |= self._is_turned(seen.fit.turn)
+        is_distant = self._is_distant(seen.fit.error, time)
+        is_other = differs or is_distant or self._is_turned(seen.fit.turn)
         low, high = self._span if not is_other else self.learned.span
         if not low < seen.alpha < high:
             return (
